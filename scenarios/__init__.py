@@ -1,0 +1,1 @@
+"""Scenarios as commented YAML: one for each published experiment and one default."""

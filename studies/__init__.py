@@ -1,0 +1,1 @@
+"""Many runs: sampled, executed, stored once, summarised, held against published figures."""

@@ -1,0 +1,1 @@
+"""Controllers: from setpoint and estimate to actuator commands."""

@@ -1,0 +1,1 @@
+"""PX4's EKF2: delayed horizon, ring buffers, sequential fusion, output predictor."""
