@@ -19,6 +19,7 @@ FLOORS = [
         "systems.vision",
         "systems.signals",
         "systems.frames",
+        "systems.runway_frames",
         "systems.configuration",
         "systems.schedule",
     ),

@@ -56,10 +56,12 @@ class Layout:
 
     def slice(self, vector: str) -> slice:
         """The slice of a vector's components: `slice("p_WB")` covers `p_WB_x` … `p_WB_z`."""
-        indices = [i for i, field in enumerate(self.fields) if field.rpartition("_")[0] == vector]
-        if not indices or indices != list(range(indices[0], indices[-1] + 1)):
+        components = [_is_component(field, vector) for field in self.fields]
+        if vector in self._index or not any(components):
             raise KeyError(f"layout {self.name} has no vector {vector}")
-        return slice(indices[0], indices[-1] + 1)
+        start = components.index(True)
+        length = next((n for n, own in enumerate(components[start:]) if not own), None)
+        return slice(start, self.size if length is None else start + length)
 
     def zeros(self) -> np.ndarray:
         """A vector of this layout, all zeros."""
@@ -68,6 +70,12 @@ class Layout:
     def __call__(self, array: np.ndarray) -> Any:
         """A named view of `array` (shape (size,)): reads and writes go through."""
         return self.view(array)
+
+
+def _is_component(field: str, name: str) -> bool:
+    """Whether `field` is `name` with an axis: `delta_angle_x` is, `delta_angle_dt` is not."""
+    prefix, _, axis = field.rpartition("_")
+    return prefix == name and set(axis) <= set("wxyzr")
 
 
 def vector(name: str, components: Sequence[str] = "xyz") -> tuple[str, ...]:
@@ -190,6 +198,22 @@ INFRARED = measurement_layout(
             for i in range(INFRARED_BLOBS)
             for field in ("x", "y", "area")
         ),
+    ),
+)
+
+SVGS_LEDS = 4
+SVGS = measurement_layout(
+    "SvgsMeasurement",
+    (
+        "beacon",  # 0 short, 1 medium, 2 long range; -1 none
+        "error_code",  # 0 a pose, otherwise see systems.vision.svgs_selection
+        "blob_count",  # all blobs of the frame
+        *vector("p_CT"),  # m, the beacon's origin from the camera
+        *vector("q_CT", "wxyz"),  # attitude of the beacon
+        # Covariance of p_CT (m2) and of a small turn about C's axes (rad2), upper triangle
+        *(f"covariance_{i}{j}" for i in range(6) for j in range(i, 6)),
+        "reprojection_error",  # px rms
+        *(f"led_{i}_{axis}" for i in range(SVGS_LEDS) for axis in "uv"),  # px, blobs used
     ),
 )
 
