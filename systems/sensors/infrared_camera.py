@@ -1,0 +1,224 @@
+"""The infrared camera, an IR-LOCK: directions of up to five bright spots, 50 times a second."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
+
+from systems.configuration import (
+    Finite,
+    Metres,
+    NonNegative,
+    Positive,
+    Vector3,
+    configuration,
+)
+from systems.schedule import CLOCK_PERIOD
+from systems.signals.measurement import (
+    BODY_STATE,
+    INFRARED,
+    INFRARED_BLOBS,
+    PAD_STATE,
+    SEQUENCE_NUMBER,
+    TIME_OF_ARRIVAL,
+    TIME_OF_VALIDITY,
+    no_measurement,
+)
+from systems.signals.noise import stream_key
+from systems.vision.exposure import EXPOSURE, expose, is_due
+from systems.vision.infrared_blobs import (
+    MAXIMUM_SPOTS,
+    THRESHOLD,
+    black_level,
+    detect_blobs,
+    project_spots,
+    render_spots,
+    write_blobs,
+    write_geometric_blobs,
+)
+from systems.vision.pinhole import camera_mount, pinhole_camera
+
+_PAD_AT_ORIGIN = PAD_STATE.zeros()
+
+
+@configuration
+class FalseBeacon:
+    """A lamp or a glint of the sun that is not the beacon."""
+
+    position: Vector3 = Field(default_factory=lambda: [3.0, 0.0, 0.0])  # m, W
+    strength: NonNegative = 1.0  # 1, brightness relative to the beacon
+
+
+@configuration
+class InfraredCameraConfig:
+    """An IR-LOCK: a Pixy of 320x200 pixels behind an infrared filter, and its MarkOne beacon."""
+
+    # Project the beacons, or render and detect
+    fidelity: Literal["pixels", "geometric"] = "geometric"
+    width: Annotated[int, Field(ge=16, le=4096)] = 320  # px
+    height: Annotated[int, Field(ge=16, le=4096)] = 200  # px
+    pixel_angle: Positive = 0.003  # rad a pixel in the middle of the image
+    frame_rate: Annotated[float, Field(gt=0.0, le=1.0 / CLOCK_PERIOD)] = 50.0  # 1/s
+    position: Vector3 = Field(default_factory=lambda: [0.0, 0.0, -0.05])  # m, p_BC
+    yaw: Finite = 0.0  # rad, turn of the camera about z_B; at 0 the image's top is the body's front
+    # Report whole pixels, as the Pixy does, or the centroid
+    quantised: bool = True
+    beacon_position: Vector3 = Field(
+        default_factory=lambda: [0.0, 0.0, 0.0]
+    )  # m, P, from its centre
+    # m, at which the beacon is just seen: MarkOne 15, MarkOne V3 40 to 55 (SVGS paper, section 4)
+    maximum_range: Positive = 15.0
+    lamp_radius: Metres = 0.02  # m, of the beacon's array of diodes
+    noise: NonNegative = 2.0  # grey levels of 255, one sigma
+    false_beacons: Annotated[list[FalseBeacon], Field(max_length=MAXIMUM_SPOTS - 1)] = Field(
+        default_factory=list
+    )
+
+    def add_to(self, builder: DiagramBuilder, name: str, seed: int) -> "InfraredCamera":
+        """Add an `InfraredCamera`; `name` also names its random stream."""
+        return builder.AddNamedSystem(name, InfraredCamera(self, seed, stream=name))
+
+
+class InfraredCamera(LeafSystem):
+    """A camera under the vehicle that reports the brightest infrared spots.
+
+    .. pydrake_system::
+
+        name: InfraredCamera
+        input_ports:
+        - body
+        - pad
+        output_ports:
+        - measurement
+        - image
+
+    | port | layout | meaning |
+    |---|---|---|
+    | `body` | `BODY_STATE` | the vehicle's true state |
+    | `pad` (optional) | `PAD_STATE` | the pad's; unconnected: at rest in W's origin, yaw 0 |
+    | `measurement` | `INFRARED` | up to five blobs, the largest first, the beacon or not |
+    | `image` | uint8 array (height, width) | the image behind the measurement |
+
+    A lamp's image and what becomes of it are described in `systems.vision.infrared_blobs`.
+    With `fidelity` "pixels" each frame is rendered and its blobs are found; with "geometric"
+    the pixels of each spot above the threshold are counted instead. An image without a blob
+    is a measurement with `valid` = 0. The exposure is taken as short. Processing and
+    transport are a `DelayLine` behind the camera. The image is not kept: it is rendered
+    again, in both fidelities, from the exposure's pose and the frame's number.
+
+    State: the measurement; the exposure it was made of (EXPOSURE).
+
+    | event | period | offset | does |
+    |---|---|---|---|
+    | discrete update | 16 ms | 0 ms, phase "sense" | a frame, if one is due by its rate |
+
+    So frames fall on the 16 ms grid, the first at 0, `frame_rate` a second on average
+    (`systems.vision.exposure.is_due`).
+
+    Parameters
+    ----------
+    config : InfraredCameraConfig
+    seed : int
+    stream : str
+        The name of the random stream; cameras that share it under one seed err alike.
+    """
+
+    def __init__(
+        self, config: InfraredCameraConfig, seed: int = 0, *, stream: str = "infrared_camera"
+    ):
+        super().__init__()
+        self._stream = stream
+        self.configure(config, seed)
+        self._body = self.DeclareVectorInputPort("body", BasicVector(BODY_STATE.size))
+        self._pad = self.DeclareVectorInputPort("pad", BasicVector(PAD_STATE.size))
+        measurement = self.DeclareDiscreteState(no_measurement(INFRARED))
+        self.DeclareDiscreteState(EXPOSURE.zeros())
+        self.DeclareStateOutputPort("measurement", measurement)
+        self.DeclareAbstractOutputPort(
+            "image",
+            lambda: Value(np.zeros((0, 0), dtype=np.uint8)),
+            self._calc_image,
+            prerequisites_of_calc={self.xd_ticket()},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
+
+    def configure(self, config: InfraredCameraConfig, seed: int) -> None:
+        """Take over another configuration and seed; every field may change."""
+        self.config = config
+        self.camera = pinhole_camera(config.width, config.height, 1.0 / config.pixel_angle)
+        self.X_BC = camera_mount(config.position, config.yaw)
+        self._key = stream_key(seed, self._stream)
+        self._beacon = np.array(config.beacon_position)
+        self._false_beacons = np.array(
+            [[*lamp.position, lamp.strength] for lamp in config.false_beacons]
+        ).reshape(-1, 4)
+
+    def _render(self, exposure: np.ndarray, frame: int) -> np.ndarray:
+        config = self.config
+        spots = np.empty((MAXIMUM_SPOTS, 4))
+        count = project_spots(
+            exposure,
+            self._beacon,
+            self._false_beacons,
+            config.lamp_radius,
+            config.maximum_range,
+            self.camera,
+            spots,
+        )
+        return render_spots(spots, count, self.camera, config.noise, self._key, frame)
+
+    def _update(self, context: Context, values: DiscreteValues) -> EventStatus:
+        config = self.config
+        now = context.get_time()
+        if not is_due(now, config.frame_rate):
+            return EventStatus.DidNothing()
+        exposure = values.get_mutable_value(1)
+        expose(
+            self._body.Eval(context),
+            self._pad.Eval(context) if self._pad.HasValue(context) else _PAD_AT_ORIGIN,
+            self.X_BC,
+            self.camera,
+            0.0,
+            exposure,
+        )
+        measurement = values.get_mutable_value(0)
+        measurement[TIME_OF_VALIDITY] = measurement[TIME_OF_ARRIVAL] = now
+        measurement[SEQUENCE_NUMBER] += 1.0
+        frame = int(measurement[SEQUENCE_NUMBER])
+        if config.fidelity == "geometric":
+            write_geometric_blobs(
+                exposure,
+                self._beacon,
+                self._false_beacons,
+                config.lamp_radius,
+                config.maximum_range,
+                self.camera,
+                config.quantised,
+                self._key,
+                frame,
+                measurement,
+            )
+        else:
+            blobs = np.empty((INFRARED_BLOBS, 3))
+            image = self._render(exposure, frame)
+            count = detect_blobs(
+                image, THRESHOLD + black_level(config.noise), config.quantised, blobs
+            )
+            write_blobs(blobs, count, self.camera, measurement)
+        return EventStatus.Succeeded()
+
+    def _calc_image(self, context: Context, output: Value) -> None:
+        frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])
+        if frame < 0:  # before the first frame
+            output.set_value(np.zeros((self.config.height, self.config.width), dtype=np.uint8))
+        else:
+            output.set_value(self._render(context.get_discrete_state(1).value(), frame))
