@@ -1,0 +1,183 @@
+"""The thesis's filter: a five-state error filter on the inertial navigation, phase by phase."""
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from systems.configuration import Metres, NonNegative, Positive, Probability, configuration
+from systems.estimators.runway_error_filter_kernel import initial_memory, step
+from systems.runway_frames import RunwayConfig
+from systems.sensors.runway_camera import RunwayCameraConfig
+from systems.signals.measurement import Layout, no_measurement
+from systems.signals.runway_measurement import (
+    ACT_OFFSET,
+    AIRSPEED,
+    ANTENNA,
+    ATTITUDE_PERIOD,
+    BARO_INERTIAL,
+    FIX,
+    INERTIAL_NAVIGATION,
+    LASER_HEIGHT,
+    MAGNETIC_HEADING,
+    NAVIGATION_ESTIMATE,
+    PHASE_STATUS,
+    PICTURE,
+    WHEEL_SPEED,
+)
+
+# The inputs of both filters, so that one takes the other's place in the diagram.
+FILTER_INPUTS: tuple[tuple[str, Layout], ...] = (
+    ("inertial", INERTIAL_NAVIGATION),
+    ("baro", BARO_INERTIAL),
+    ("fix", FIX),
+    ("antenna", ANTENNA),
+    ("picture", PICTURE),
+    ("laser", LASER_HEIGHT),
+    ("phase", PHASE_STATUS),
+    ("heading", MAGNETIC_HEADING),
+    ("wheel_speed", WHEEL_SPEED),
+    ("airspeed", AIRSPEED),
+)
+_ALWAYS = frozenset(range(7))
+# the phases in which the thesis's filter looks at an input; reading a port costs time
+_USED_IN = (_ALWAYS, _ALWAYS, {0}, {1}, {2, 3}, {3})
+_NOTHING = tuple(no_measurement(layout) for _, layout in FILTER_INPUTS[:6])
+
+
+@configuration
+class RunwayErrorFilterConfig:
+    """Process and sensor noise from the sensors' specification, times the hand tuning of 4.3."""
+
+    kind: Literal["error_filter"] = "error_filter"
+    tuning: Literal["theoretical", "hand"] = "hand"  # hand: Q 2.25, R 400, 100 and 400 times
+    # theoretical standard deviations of one step of 20 ms
+    position_walk: Metres = 0.001  # m, √q1 and √q2
+    altitude_walk: Metres = 0.01  # m, √q3: scale factor of the altimeter times the descent
+    speed_walk: NonNegative = 0.002  # m/s, √q4 and √q5: 0.2 m/s in a landing of 150 s
+    return_noise: Positive = 0.2  # deg, of the antenna's azimuth
+    final_noise: Positive = 1.0  # mrad, of the tracker, about one pixel
+    laser_noise: Positive = 0.1  # m
+    # the laser's activation (4.2): the share of the altitude's innovation that is taken over
+    # at once (1 reset, 0 covariance only), and the standard deviation that is added
+    altitude_reset: Probability = 0.5
+    altitude_increase: Metres = 3.0  # m
+    camera: RunwayCameraConfig = Field(default_factory=RunwayCameraConfig)  # as known on board
+
+    def add_to(
+        self, builder: DiagramBuilder, name: str, seed: int, runway: RunwayConfig | None = None
+    ) -> "RunwayErrorFilter":
+        """Add the filter to a builder."""
+        return builder.AddNamedSystem(name, RunwayErrorFilter(self, seed, runway))
+
+    def parameters(self, runway: RunwayConfig) -> np.ndarray:
+        """The flat parameters of the kernel, shape (PARAMETERS,)."""
+        hand = self.tuning == "hand"
+        q, r_return, r_final, r_laser = (2.25, 400.0, 100.0, 400.0) if hand else (1.0,) * 4
+        station = runway.ground_station_n()
+        return np.array(
+            [
+                q * self.position_walk**2,
+                q * self.altitude_walk**2,
+                q * self.speed_walk**2,
+                r_return * np.radians(self.return_noise) ** 2,
+                r_final * (1e-3 * self.final_noise) ** 2,
+                r_laser * self.laser_noise**2,
+                self.altitude_reset,
+                self.altitude_increase**2,
+                station[0],
+                station[1],
+                *self.camera.optics(),
+                *self.camera.position,
+                *self.camera.mounting_radians(),
+            ]
+        )
+
+
+class RunwayErrorFilter(LeafSystem):
+    """Estimates the errors of the inertial navigation and takes them out (Leonard 2016, 4).
+
+    .. pydrake_system::
+
+        name: RunwayErrorFilter
+        input_ports:
+        - inertial
+        - baro
+        - fix
+        - antenna
+        - picture
+        - laser
+        - phase
+        - heading
+        - wheel_speed
+        - airspeed
+        output_ports:
+        - estimate
+
+    | port | layout | meaning |
+    |---|---|---|
+    | inertial | INERTIAL_NAVIGATION | position, speed and attitude, drifting |
+    | baro | BARO_INERTIAL | the vertical position |
+    | fix | FIX | used in Standby |
+    | antenna | ANTENNA | azimuth, used in Return |
+    | picture | PICTURE | the tracked touch-down point, used in Final |
+    | laser | LASER_HEIGHT | used in Final with laser |
+    | phase | PHASE_STATUS | which measurements count |
+    | heading | MAGNETIC_HEADING | (optional) not used by the thesis's filter |
+    | wheel_speed | WHEEL_SPEED | (optional) not used |
+    | airspeed | AIRSPEED | (optional) not used |
+    | estimate | NAVIGATION_ESTIMATE | the corrected navigation |
+
+    Equations: `systems.estimators.runway_error_filter_kernel`. The covariance is
+    kept from phase to phase; when the laser is activated the altitude is reset,
+    its covariance increased, or both by halves (4.2).
+
+    | event | when | what |
+    |---|---|---|
+    | step | every 10 ms from 5 ms | fuses what arrived; propagates with each new position |
+    """
+
+    def __init__(
+        self,
+        config: RunwayErrorFilterConfig,
+        seed: int = 0,
+        runway: RunwayConfig | None = None,
+    ):
+        super().__init__()
+        self.configure(config, seed, runway)
+        self._inputs = [
+            self.DeclareVectorInputPort(name, layout.size) for name, layout in FILTER_INPUTS
+        ]
+        estimate = self.DeclareDiscreteState(NAVIGATION_ESTIMATE.size)
+        self.DeclareDiscreteState(initial_memory())
+        self.DeclareStateOutputPort("estimate", estimate)
+        self.DeclarePeriodicDiscreteUpdateEvent(ATTITUDE_PERIOD, ACT_OFFSET, self._step)
+
+    def configure(
+        self,
+        config: RunwayErrorFilterConfig,
+        seed: int = 0,
+        runway: RunwayConfig | None = None,
+    ) -> None:
+        """Take a new tuning and runway."""
+        self._parameters = config.parameters(runway or RunwayConfig())
+
+    def _step(self, context, discrete_state):
+        phase = int(self._inputs[6].Eval(context)[0])
+        inertial, baro, fix, antenna, picture, laser = (
+            port.Eval(context) if phase in used else nothing
+            for port, used, nothing in zip(self._inputs, _USED_IN, _NOTHING, strict=False)
+        )
+        step(
+            discrete_state.get_mutable_value(0),
+            discrete_state.get_mutable_value(1),
+            inertial,
+            baro,
+            fix,
+            antenna,
+            picture,
+            laser,
+            float(phase),
+            self._parameters,
+        )
