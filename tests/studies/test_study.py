@@ -1,0 +1,184 @@
+import dataclasses
+import pickle
+from pathlib import Path
+
+import pytest
+
+from diagrams.loading import load_scenario
+from studies.published import PUBLISHED
+from studies.sampling import Choice, Uniform
+from studies.study import Study, StudyError, Variant, list_studies, load_study, study_names
+
+
+@pytest.fixture
+def study() -> Study:
+    return Study(
+        name="latency",
+        scenario="default",
+        overrides={"cameras.fidelity": "geometric"},
+        variants={
+            "weighted": Variant(label="Weighted average"),
+            "ours": Variant(overrides={"estimator.kind": "time_stamped"}),
+        },
+        grids={"camera.latency": [0.0, 0.1, 0.2], "wind.speed": [0.0, 5.0]},
+        distributions={
+            "start.height": Uniform(low=5.0, high=15.0),
+            "start.heading": Choice(values=["north", "east"]),
+        },
+    )
+
+
+def test_conditions_are_variants_times_grid_points(study: Study):
+    conditions = study.conditions
+    assert len(conditions) == 2 * 3 * 2
+    assert len({condition.label for condition in conditions}) == len(conditions)
+    assert conditions[1].point == {"camera.latency": 0.0, "wind.speed": 5.0}
+    assert conditions[1].label == "Weighted average, camera.latency = 0.0, wind.speed = 5.0"
+    assert conditions[6].variant == "ours"
+
+
+def test_runs_of_one_pair_share_seed_and_draws_across_all_conditions(study: Study):
+    specs = list(study.run_specs(12 * 50))
+    assert [spec.run for spec in specs] == list(range(600))
+    seeds = set()
+    for pair in range(50):
+        members = specs[12 * pair : 12 * pair + 12]
+        assert len({spec.seed for spec in members}) == 1
+        assert len({spec.overrides["start.height"] for spec in members}) == 1
+        assert [spec.condition for spec in members] == study.conditions
+        seeds.add(members[0].seed)
+    assert len(seeds) == 50
+
+
+def test_overrides_are_the_studys_the_variants_and_what_varies(study: Study):
+    spec = study.run_spec(6 + 3)
+    assert spec.overrides == {
+        "cameras.fidelity": "geometric",
+        "estimator.kind": "time_stamped",
+        "camera.latency": 0.1,
+        "wind.speed": 5.0,
+        "start.height": spec.varied["start.height"],
+        "start.heading": spec.varied["start.heading"],
+    }
+    assert 5.0 <= spec.overrides["start.height"] <= 15.0
+
+
+def test_a_variants_override_wins_over_the_studys(study: Study):
+    study.variants["ours"].overrides["cameras.fidelity"] = "pixels"
+    assert study.run_spec(0).overrides["cameras.fidelity"] == "geometric"
+    assert study.run_spec(6).overrides["cameras.fidelity"] == "pixels"
+
+
+def test_a_variants_distribution_stands_in_for_the_studys_with_the_same_draw(study: Study):
+    study.variants["ours"].distributions["start.height"] = Uniform(low=100.0, high=120.0)
+    for pair in range(20):
+        usual, own = study.run_spec(12 * pair), study.run_spec(12 * pair + 6)
+        share = (usual.overrides["start.height"] - 5.0) / 10.0
+        assert own.overrides["start.height"] == pytest.approx(100.0 + 20.0 * share)
+        assert own.seed == usual.seed
+
+
+def test_seeds_hang_on_the_definition_and_the_campaign_seed_alone(study: Study):
+    def seed(**changes) -> int:
+        return dataclasses.replace(study, **changes).run_spec(0).seed
+
+    same = study.run_spec(0).seed
+    assert seed(runs=5000) == same
+    assert seed(description="in other words") == same
+    assert seed(seed=1) != same
+    assert seed(scenario="windy") != same
+    assert seed(grids={"wind.speed": [0.0, 5.0]}) != same
+    assert seed(variants=dict(reversed(study.variants.items()))) != same
+
+
+def test_more_runs_keep_those_before(study: Study):
+    assert list(study.run_specs(30)) == list(study.run_specs(90))[:30]
+
+
+def test_a_study_survives_json_and_pickling(study: Study):
+    for copy in (Study.from_json(study.to_json()), pickle.loads(pickle.dumps(study))):
+        assert copy == study
+        assert copy.digest == study.digest
+        assert copy.run_spec(7) == study.run_spec(7)
+
+
+def test_without_variants_the_scenario_flies_as_it_is():
+    study = Study(name="plain", scenario="default")
+    assert [condition.label for condition in study.conditions] == ["default"]
+    assert study.run_spec(3).overrides == {}
+    assert study.run_spec(3).pair == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("scenario: default\nrunz: 10\n", r"line 2: runz: unknown field, .*the nearest is runs"),
+        ("scenario: default\nruns: 0\n", "line 2: runs: expected greater than or equal to 1"),
+        ("name: x\n", "scenario: is missing"),
+        ("scenario: [\n", "not YAML"),
+        ("- 1\n", "expected the fields of a study"),
+        (
+            "scenario: d\ndistributions:\n  wind: {kind: norml, mean: 0, sigma: 1}\n",
+            "distributions.wind: kind 'norml' is unknown, .*the nearest is normal",
+        ),
+        (
+            "scenario: d\ndistributions:\n  wind: {kind: uniform, low: 2, high: 1}\n",
+            "distributions.wind: expected low <= high, found 2.0 and 1.0",
+        ),
+        (
+            "scenario: d\ngrids: {wind: [1]}\noverrides: {wind: 2}\n",
+            "wind is set by grids and by overrides: expected one",
+        ),
+        (
+            "scenario: d\noverrides: {w: 2}\nvariants: {a: {distributions: {w: {kind: uniform, "
+            "low: 0, high: 1}}}}\n",
+            "w is set by overrides and by variants.a.distributions",
+        ),
+        (
+            "scenario: d\nvariants: {a: {label: x}, b: {label: x}}\n",
+            "two conditions are called 'x'",
+        ),
+        ("scenario: d\ngrids: {wind: [1, 1]}\n", "two conditions are called 'wind = 1'"),
+        ("scenario: d\ngrids: {wind: []}\n", "grids.wind: expected"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_sentence(tmp_path: Path, text: str, expected: str):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    with pytest.raises(StudyError, match=expected) as raised:
+        load_study(file)
+    assert str(file) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_takes_its_name_for_the_study(tmp_path: Path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("scenario: default\n")
+    assert load_study(file).name == "mine"
+
+
+def test_an_unknown_study_is_answered_with_the_nearest():
+    with pytest.raises(StudyError, match="nearest is infrared-and-marker"):
+        load_study("infrared-and-maker")
+    with pytest.raises(StudyError, match="cannot be read"):
+        load_study("absent.yaml")
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_every_condition_of_every_study_is_a_scenario(name: str):
+    study = load_study(name)
+    assert study.name == name
+    assert study.description
+    for spec in study.run_specs(2 * len(study.conditions)):
+        load_scenario(study.scenario, spec.overrides)
+
+
+def test_the_thesis_study_holds_every_row_of_its_tables():
+    study = list_studies()["infrared-and-marker"]
+    held = [variant.published for variant in study.variants.values()]
+    assert len(held) == 13
+    assert set(held) == set(PUBLISHED)  # Table 12 twice: as the default of Table 5 too
+    for variant in study.variants.values():
+        assert variant.published is not None
+        row = PUBLISHED[variant.published]
+        assert variant.overrides.get("guidance.mission.altitude", 10.0) == row.initial_height
