@@ -1,19 +1,27 @@
 """Graphs of diagrams: DOT always, SVG and PNG where Graphviz's `dot` is installed."""
 
 import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pydot
 from pydrake.systems.framework import System
 
 FORMATS = ("dot", "svg", "png")
+RECORDERS = ("record ", "log ")  # how diagrams.recording names what only records
+_STYLE = """graph [fontname="Helvetica"];
+node [fontname="Helvetica", fontsize=11];
+edge [fontname="Helvetica", fontsize=10, color="#0072b2", arrowsize=0.7];
+"""
 
 
 class GraphError(RuntimeError):
     """A graph that cannot be drawn; its text is one sentence for the user."""
 
 
-def wiring_dot(diagram: System, max_depth: int | None = None) -> str:
+def wiring_dot(
+    diagram: System, max_depth: int | None = None, hide: Sequence[str] = RECORDERS
+) -> str:
     """The wiring of a system as DOT text.
 
     Parameters
@@ -22,13 +30,33 @@ def wiring_dot(diagram: System, max_depth: int | None = None) -> str:
         Any Drake system.
     max_depth : int, optional
         How many levels of sub-diagrams to open; all if not given.
+    hide : sequence of str
+        Systems whose names begin so are left out, with their connections.
     """
     depth = 1_000 if max_depth is None else max_depth
     graph = _parse(diagram.GetGraphvizString(max_depth=depth))
-    graph.set_graph_defaults(fontname="Helvetica")
-    graph.set_node_defaults(fontname="Helvetica", fontsize="11")
-    graph.set_edge_defaults(color="#0072b2aa", arrowsize="0.7")
-    return graph.to_string()
+    parts = list(_parts(graph))
+    hidden = {
+        node.get_name()
+        for part in parts
+        for node in part.get_nodes()
+        if any(f"name={prefix}" in str(node.get("label")) for prefix in hide)
+    }
+    for part in parts:
+        for name in hidden:
+            part.del_node(name)
+        for edge in part.get_edges():
+            ends = (str(edge.get_source()), str(edge.get_destination()))
+            if hidden & {end.partition(":")[0] for end in ends}:
+                part.del_edge(edge.get_source(), edge.get_destination())
+    return graph.to_string().replace("{", f"{{\n{_STYLE}", 1)
+
+
+def _parts(graph: pydot.Graph) -> Iterator[pydot.Graph]:
+    """A graph and all its subgraphs, at every depth."""
+    yield graph
+    for subgraph in graph.get_subgraphs():
+        yield from _parts(subgraph)
 
 
 def svg_of(dot: str) -> str | None:
@@ -65,4 +93,5 @@ def _parse(dot: str) -> pydot.Dot:
 
 
 def _draw(dot: str, drawing: str) -> bytes:
-    return bytes(_parse(dot).create(format=drawing))
+    drawn = _parse(dot).create(format=drawing)
+    return drawn if isinstance(drawn, bytes) else drawn.encode()

@@ -24,7 +24,7 @@ _TYPE_NAMES = {
 
 def write_ulog(
     path: Path,
-    topics: Mapping[str | tuple[str, int], np.ndarray],
+    topics: Mapping[str, np.ndarray] | Mapping[str | tuple[str, int], np.ndarray],
     parameters: Mapping[str, int | float] | None = None,
     information: Mapping[str, str] | None = None,
 ) -> None:

@@ -1,0 +1,249 @@
+"""`plumbline`: land, study, graph, scenarios.
+
+Exit status: 0 landed (or done), 1 not landed, 2 wrong input, told in one sentence.
+Heavy modules are imported inside the commands so that `--help` answers at once.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+DEFAULT_SCENARIO = "infrared-and-marker"
+WRONG_INPUT = 2
+
+
+class WrongInput(click.ClickException):
+    """Wrong input: one sentence on standard error, exit status 2."""
+
+    exit_code = WRONG_INPUT
+
+    def show(self, file: Any = None) -> None:
+        """Print the sentence."""
+        click.echo(f"plumbline: {self.message}", err=True)
+
+
+def _scenario_options(command: Callable) -> Callable:
+    command = click.option(
+        "--set",
+        "overrides",
+        metavar="FIELD.PATH=VALUE",
+        multiple=True,
+        help="Change a field of the scenario, e.g. --set wind.speed=5; repeatable.",
+    )(command)
+    return click.argument("scenario", default=DEFAULT_SCENARIO)(command)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="plumbline")
+def cli() -> None:
+    """Precision landings on Drake: what latency, gate, fault or wind can yours survive?"""
+
+
+@cli.command()
+@_scenario_options
+@click.option(
+    "--seed", type=click.IntRange(min=0), help="Seed of all noise; the scenario's own if not given."
+)
+@click.option(
+    "--fidelity",
+    type=click.Choice(["pixels", "geometric"]),
+    help="Cameras by real images or by an error model.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Folder for run.json, log.parquet, report.html.  [default: out/SCENARIO-SEED]",
+)
+@click.option(
+    "--live", is_flag=True, help="Show the flight in Meshcat, at real-time rate, while it happens."
+)
+@click.option("--from", "from_", metavar="DIR/RUN", help="Repeat exactly one run of a campaign.")
+@click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
+def land(
+    scenario: str,
+    overrides: tuple[str, ...],
+    seed: int | None,
+    fidelity: str | None,
+    out: Path | None,
+    live: bool,
+    from_: str | None,
+    report: bool,
+) -> None:
+    """Fly SCENARIO once, from take-off to touchdown.
+
+    SCENARIO is a name from `plumbline scenarios` or a YAML file.
+    """
+    extra = [*overrides]
+    if from_ is not None:
+        scenario, repeated = _run_of_campaign(from_)
+        extra = [*repeated, *extra]
+    if seed is not None:
+        extra.append(f"seed={seed}")
+    if fidelity is not None:
+        extra.append(f"fidelity={fidelity}")
+    loaded = _load(scenario, extra)
+    folder = _writable_folder(out or Path("out") / f"{loaded.name}-{loaded.seed}")
+
+    from diagrams.loading import ScenarioError
+    from runs.flight import fly_and_report
+
+    try:
+        result = fly_and_report(loaded, folder, live=live, report=report)
+    except ScenarioError as error:
+        raise WrongInput(str(error)) from None
+    verdict = "Landed" if result.landed else "Not landed"
+    click.echo(f"{verdict}: {result.reason}")
+    if result.landed:
+        click.echo(
+            f"Landing error {100 * result.landing_error_m:.1f} cm, "
+            f"landing time {result.landing_time_s:.1f} s, "
+            f"touchdown at {result.touchdown_speed_m_s:.2f} m/s"
+        )
+    else:
+        click.echo(f"After {result.simulated_s:.1f} s and {result.attempts} attempts")
+    click.echo(f"Report: {folder / 'report.html'}" if report else f"Run: {folder / 'run.json'}")
+    sys.exit(0 if result.landed else 1)
+
+
+@cli.command()
+@_scenario_options
+@click.option(
+    "--depth", type=click.IntRange(min=0), help="Levels of sub-diagrams to open; all if not given."
+)
+@click.option("--states", is_flag=True, help="Draw the supervisor's states instead of the wiring.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("graph.svg"),
+    show_default=True,
+    help="A .dot, .svg or .png file.",
+)
+def graph(
+    scenario: str, overrides: tuple[str, ...], depth: int | None, states: bool, out: Path
+) -> None:
+    """Draw the wiring of SCENARIO, or its supervisor's states."""
+    loaded = _load(scenario, overrides)
+
+    from diagrams.graph import GraphError, wiring_dot, write_graph
+    from diagrams.loading import ScenarioError
+    from runs.run import Laboratory
+
+    try:
+        built = Laboratory(loaded).landing
+    except ScenarioError as error:
+        raise WrongInput(str(error)) from None
+    dot = built.states_dot() if states else wiring_dot(built.diagram, depth)
+    try:
+        write_graph(dot, out)
+    except GraphError as error:
+        raise WrongInput(str(error)) from None
+    except OSError as error:
+        raise WrongInput(f"{out}: cannot be written: {error.strerror}") from None
+    click.echo(f"Graph: {out}")
+
+
+@cli.command()
+@click.argument("name", required=False)
+def scenarios(name: str | None) -> None:
+    """List the scenarios; with NAME, print that scenario with every field."""
+    from diagrams.loading import scenario_names, to_yaml
+
+    if name is not None:
+        click.echo(to_yaml(_load(name, ())), nl=False)
+        return
+    names = scenario_names()
+    width = max(len(entry) for entry in names)
+    for entry in names:
+        click.echo(f"{entry:{width}}  {_load(entry, ()).description}")
+
+
+@cli.command()
+@click.argument("words", nargs=-1, metavar="NAME | resume DIR")
+@click.option("--list", "list_", is_flag=True, help="List the studies.")
+@click.option("--runs", type=click.IntRange(min=1), help="Landings, all variants together.")
+@click.option("--workers", type=click.IntRange(min=0), help="Processes.  [default: one a core]")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the campaign.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Folder of the campaign.  [default: out/studies/NAME]",
+)
+@click.option("--scheduler", help="Address of a Dask scheduler whose workers fly, tcp://HOST:PORT.")
+def study(
+    words: tuple[str, ...],
+    list_: bool,
+    runs: int | None,
+    workers: int | None,
+    seed: int | None,
+    out: Path | None,
+    scheduler: str | None,
+) -> None:
+    """Fly the study NAME (or a YAML file), or go on with the campaign in DIR."""
+    from studies.campaign import resume, run_study
+    from studies.study import StudyError, list_studies
+
+    if list_:
+        known = list_studies()
+        width = max(len(name) for name in known)
+        for name, entry in known.items():
+            click.echo(f"{name:{width}}  {' '.join(entry.description.split())}")
+        return
+    try:
+        match words:
+            case ("resume", campaign):
+                result = resume(Path(campaign), workers, scheduler)
+            case (name,) if name != "resume":
+                folder = out or Path("out") / "studies" / Path(name).stem
+                result = run_study(name, folder, runs, workers, seed, scheduler)
+            case _:
+                raise WrongInput("study: expected the NAME of a study, or: resume DIR")
+    except StudyError as error:
+        raise WrongInput(str(error)) from None
+    click.echo(f"{result.done} of {result.runs} runs")
+    if not result.complete:
+        click.echo(f"To go on: plumbline study resume {result.folder}")
+    click.echo(f"Report: {result.folder / 'report.html'}")
+    sys.exit(0 if result.complete else 1)
+
+
+def _load(scenario: str, overrides: Any) -> Any:
+    from diagrams.loading import ScenarioError, load_scenario
+
+    try:
+        return load_scenario(scenario, overrides)
+    except ScenarioError as error:
+        raise WrongInput(str(error)) from None
+
+
+def _run_of_campaign(reference: str) -> tuple[str, list[str]]:
+    """The scenario of one run of a campaign, and its overrides as for --set."""
+    from studies.campaign import read_run
+    from studies.study import StudyError
+
+    try:
+        flown, run = read_run(reference)
+    except StudyError as error:
+        raise WrongInput(f"--from {reference}: {error}") from None
+    overrides = {**run.overrides, "seed": run.seed}
+    return flown.scenario, [f"{path}={json.dumps(value)}" for path, value in overrides.items()]
+
+
+def _writable_folder(folder: Path) -> Path:
+    """Make a folder and be sure that files can be written there, before anything long runs."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".plumbline-probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise WrongInput(f"--out {folder}: cannot be written: {error.strerror}") from None
+    return folder
+
+
+def main() -> None:
+    """Entry point of the `plumbline` command."""
+    cli(prog_name="plumbline")

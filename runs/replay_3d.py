@@ -1,0 +1,91 @@
+"""The 3-D replay of a run, and the live view of one that is going on, in Meshcat."""
+
+import logging
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
+from pydrake.systems.framework import Context, EventStatus
+
+from diagrams.landing import LandingDiagram
+from diagrams.scenario import MultirotorLanding
+from plants.illustration import draw, move
+from runs.logs import port_samples
+from systems.signals.measurement import BODY_STATE, PAD_STATE
+
+FRAME_RATE = 31.25  # 1/s, that of the log
+_TRACK = Rgba(0.0, 0.45, 0.70, 1.0)
+_PATH = "/plumbline"
+
+
+@cache
+def meshcat() -> Meshcat:
+    """The Meshcat of this process, started when it is first asked for."""
+    logging.getLogger("drake").setLevel(logging.WARNING)  # it would announce its port
+    return Meshcat(MeshcatParams(show_stats_plot=False))
+
+
+def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
+    """A self-contained page that replays a flight in 3-D.
+
+    Parameters
+    ----------
+    scenario : MultirotorLanding
+        Whose vehicle and pad to draw.
+    log : pa.Table
+        Whose ports `body` and `pad` to follow.
+    """
+    scene = _scene(scenario)
+    body, pad = _rows(log, "body", BODY_STATE.fields), _rows(log, "pad", PAD_STATE.fields)
+    track = body[::4, BODY_STATE.slice("p_WB")].T
+    scene.SetLine(f"{_PATH}/track", np.asfortranarray(track), 2.0, _TRACK)
+    scene.StartRecording(FRAME_RATE, set_visualizations_while_recording=False)
+    for frame in range(len(body)):
+        move(scene, body[frame], pad[frame], frame / FRAME_RATE)
+    scene.StopRecording()
+    scene.PublishRecording()
+    page = scene.StaticHtml()
+    scene.Delete()
+    scene.DeleteRecording()
+    return page
+
+
+def live_view(landing: LandingDiagram, scenario: MultirotorLanding) -> Callable:
+    """A monitor for `Simulator.set_monitor` that shows the flight as it happens.
+
+    The page's address is `meshcat().web_url()`.
+    """
+    scene = _scene(scenario)
+    shown = -1.0
+
+    def show(context: Context) -> EventStatus:
+        nonlocal shown
+        time = context.get_time()
+        if time >= shown + 1.0 / FRAME_RATE:
+            shown = time
+            move(scene, landing.evaluate("body", context), landing.evaluate("pad", context))
+        return EventStatus.DidNothing()
+
+    return show
+
+
+def _scene(scenario: MultirotorLanding) -> Meshcat:
+    """Meshcat with the vehicle, the pad and the ground, and a camera that sees the flight."""
+    scene = meshcat()
+    scene.Delete()
+    scene.SetProperty("/Grid", "visible", False)
+    scene.SetProperty("/Axes", "visible", False)
+    scene.SetProperty("/Background", "top_color", [0.62, 0.74, 0.88])
+    scene.SetProperty("/Background", "bottom_color", [0.93, 0.95, 0.97])
+    scene.SetProperty("/Lights/AmbientLight/<object>", "intensity", 1.2)
+    scene.SetProperty("/Lights/FillLight/<object>", "intensity", 1.0)
+    draw(scene, scenario.vehicle.resolved_vehicle(), scenario.pad, _PATH)
+    scene.SetCameraPose(np.array([-3.2, -5.2, 2.8]), np.array([0.4, 0.0, 1.0]))
+    return scene
+
+
+def _rows(log: pa.Table, port: str, fields: tuple[str, ...]) -> np.ndarray:
+    samples = port_samples(log, port)
+    return np.column_stack([samples[field] for field in fields])
