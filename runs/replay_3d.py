@@ -41,6 +41,7 @@ def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
     body, pad = _rows(log, "body", BODY_STATE.fields), _rows(log, "pad", PAD_STATE.fields)
     track = body[::4, BODY_STATE.slice("p_WB")].T
     scene.SetLine(f"{_PATH}/track", np.asfortranarray(track), 2.0, _TRACK)
+    move(scene, body[0], pad[0])
     scene.StartRecording(FRAME_RATE, set_visualizations_while_recording=False)
     for frame in range(len(body)):
         move(scene, body[frame], pad[frame], frame / FRAME_RATE)

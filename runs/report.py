@@ -124,7 +124,7 @@ def _figures(result: RunResult) -> list[tuple[str, str]]:
     speed = result.simulated_s / result.cpu_s if result.cpu_s > 0.0 else float("nan")
     return [
         (f"{100.0 * result.landing_error_m:.1f} cm", "landing error"),
-        (f"{x:+.1f}, {y:+.1f} cm", "east and north of the pad"),
+        (f"{x:+.0f}, {y:+.0f} cm", "east, north"),
         (f"{result.touchdown_speed_m_s:.2f} m/s", "touchdown speed"),
         (f"{result.landing_time_s:.1f} s", "landing time"),
         (f"{result.attempts}", "attempt" if result.attempts == 1 else "attempts"),
