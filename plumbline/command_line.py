@@ -1,4 +1,4 @@
-"""`plumbline`: land, study, graph, scenarios.
+"""`plumbline`: land, replay, study, graph, scenarios.
 
 Exit status: 0 landed (or done), 1 not landed, 2 wrong input, told in one sentence.
 Heavy modules are imported inside the commands so that `--help` answers at once.
@@ -208,6 +208,50 @@ def study(
         click.echo(f"To go on: plumbline study resume {result.folder}")
     click.echo(f"Report: {result.folder / 'report.html'}")
     sys.exit(0 if result.complete else 1)
+
+
+@cli.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder of the results.  [default: out/replay]"
+)
+@click.option(
+    "--param",
+    "overrides",
+    metavar="NAME=VALUE",
+    multiple=True,
+    help="Change a parameter, e.g. --param EKF2_EV_DELAY=200; repeatable.",
+)
+@click.option("--params", "file", type=click.Path(path_type=Path), help="A QGroundControl file.")
+@click.option("--defaults", type=click.Choice(["module", "unit-test"]), default="module")
+@click.option(
+    "--sweep",
+    metavar="NAME=FIRST:LAST:STEP",
+    help="Try a parameter at many values and replay with the best.",
+)
+@click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
+def replay(
+    log: Path,
+    out: Path | None,
+    overrides: tuple[str, ...],
+    file: Path | None,
+    defaults: Any,
+    sweep: str | None,
+    report: bool,
+) -> None:
+    """Run PX4's EKF2 on the sensors of LOG, a ULog or a CSV stream."""
+    folder = _writable_folder(out or Path("out") / "replay")
+
+    from runs.log_sources import ReplayError
+    from runs.replay_run import replay_and_report
+
+    try:
+        sentences = replay_and_report(log, folder, overrides, file, defaults, sweep, report)
+    except ReplayError as error:
+        raise WrongInput(str(error)) from None
+    for sentence in sentences:
+        click.echo(sentence)
+    click.echo(f"Report: {folder / 'report.html'}" if report else f"Replay: {folder}")
 
 
 def _load(scenario: str, overrides: Any) -> Any:

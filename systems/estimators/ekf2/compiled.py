@@ -10,11 +10,15 @@ from numba import njit
 
 from systems.signals import measurement
 
+_WITHOUT_KERNELS = ("__init__.py", "ekf2.py", "world_model.py")
+
 
 @cache
 def _sources() -> str:
     """A digest of everything that can change a kernel: this package and the message layouts."""
-    files = [*sorted(Path(__file__).parent.glob("*.py")), Path(measurement.__file__)]
+    package = sorted(Path(__file__).parent.glob("*.py"))
+    files = [file for file in package if file.name not in _WITHOUT_KERNELS]
+    files.append(Path(measurement.__file__))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 

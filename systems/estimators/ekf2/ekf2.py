@@ -146,8 +146,8 @@ class Ekf2(LeafSystem):
 
     | event | period | offset | what happens |
     |---|---|---|---|
-    | update | 4 ms | 2 ms | the IMU sample moves the output predictor; every second one (by
-    EKF2_PREDICT_US) completes a filter step, which also takes the other messages |
+    | update | that of the IMU | half of it | the IMU sample moves the output predictor; when the
+    samples make up EKF2_PREDICT_US, a filter step takes the other messages too |
 
     The discrete state has two groups: the filter's flat array (see `layout`) and `estimate`.
     """

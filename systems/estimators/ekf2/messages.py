@@ -209,7 +209,7 @@ def _take_vision(x, p, row, m, time):
     row[7], row[8], row[9], row[10] = math.cos(half), 0.0, 0.0, math.sin(half)
     if not math.isfinite(half):
         row[8] = row[9] = math.nan
-    row[17] = row[18] = 0.0
+    row[17] = row[18] = math.nan  # roll and pitch are not measured
     row[19] = m[_EV_YAW + 1]
     row[20] = row[21] = at.FRAME_NED
     row[22], row[23] = m[_EV_YAW + 2], m[_EV_YAW + 3]
