@@ -25,6 +25,7 @@ from systems.configuration import (
     require_same_structure,
 )
 from systems.estimators.ekf2 import filter as kernels
+from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import messages, parameters
 from systems.estimators.ekf2.world_model import earth_field
 from systems.schedule import ESTIMATE_OFFSET, PLANT_PERIOD
@@ -157,9 +158,12 @@ class Ekf2(LeafSystem):
         sizes = (GNSS, BAROMETER, MAGNETOMETER, RANGE_FINDER, EXTERNAL_VISION)
         names = ("gnss", "barometer", "magnetometer", "range_finder", "external_vision")
         self._imu = self.DeclareVectorInputPort("imu", INERTIAL.size)
-        for name, layout in zip(names, sizes, strict=True):
+        ports = [
             self.DeclareVectorInputPort(name, layout.size)
-        self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS_SIZE)
+            for name, layout in zip(names, sizes, strict=True)
+        ]
+        ports.append(self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS_SIZE))
+        self._optional = [(port, at.CONNECTED + i) for i, port in enumerate(ports)]
         self._absent = np.empty(0)
 
         self._configure(config)
@@ -220,20 +224,27 @@ class Ekf2(LeafSystem):
         write(context.get_discrete_state(self._filter).value(), out.get_mutable_value())
 
     def _input(self, context: Context, index: int) -> np.ndarray:
+        """The message in a port, of size 0 if nothing is connected."""
         value: BasicVector | None = self.EvalVectorInput(context, index)
         return self._absent if value is None else value.get_value()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         x = discrete_state.get_mutable_value(0)
         estimate = discrete_state.get_mutable_value(1)
+        parameters, absent = self._parameters, self._absent
         imu = self._imu.Eval(context)
-        vehicle_status = self._input(context, 6)
-        model = self._parameters, self._origin
-        if not messages.next_sample_completes(x) and not messages.receive_imu(
-            x, *model, imu, vehicle_status, estimate
-        ):
-            return
-        inputs = (self._input(context, index) for index in range(1, 6))
-        if messages.receive(x, *model, self._by_validity, imu, *inputs, vehicle_status, estimate):
-            kernels.update(x, self._parameters)
-            messages.write_step(x, *model, estimate)
+        if x[at.INITIALISED] == 0.0:
+            for port, connected in self._optional:
+                x[connected] = port.HasValue(context)
+        if not messages.next_sample_completes(x):
+            port, connected = self._optional[-1]
+            status = port.Eval(context) if x[connected] else absent
+            if not messages.receive_imu(x, parameters, self._origin, imu, status, estimate):
+                return
+        optional = [
+            port.Eval(context) if x[connected] else absent for port, connected in self._optional
+        ]
+        if messages.receive(x, parameters, self._by_validity, imu, *optional):
+            kernels.update(x, parameters)
+        if x[at.INITIALISED]:
+            messages.write_step(x, parameters, self._origin, estimate)

@@ -370,6 +370,7 @@ OUT_FILTER_DT = _reserve()  # s, mean
 
 # What the system's ports have already delivered, see `messages`.
 ARRIVED = _reserve(6)  # s, time of arrival of the last message of each sensor
+CONNECTED = _reserve(6)  # which optional ports have a source, in their order
 STATUS_SENT = _reserve(4)  # at rest, in air, ground effect, and when
 
 # Rings: a header each; the entries stand behind the fixed part, a time first.

@@ -310,17 +310,22 @@ def write_motion(x, p, origin, out):
 
 @kernel
 def write_resets(x, p, origin, out):
-    """Write how far a filter step made the position jump; `out` still holds it from before."""
+    """Write how far a filter step made the position jump; `out` still holds the last estimate.
+
+    What the vehicle moved since then is taken off with that estimate's velocity.
+    """
     horizontal, vertical = x[at.R_POSITION_NE], x[at.R_POSITION_D]
     if horizontal == out[_RESETS] and vertical == out[_VERTICAL_RESETS]:
         return
+    dt = max(x[at.OUT_TIME] * 1e-6 - out[0], 0.0) if out[0] >= 0.0 else 0.0
     east, north, up = position_in_world(x, p, origin)
     if horizontal != out[_RESETS]:
         out[_RESETS] = horizontal
-        out[_RESETS + 1], out[_RESETS + 2] = east - out[_P], north - out[_P + 1]
+        out[_RESETS + 1] = east - out[_P] - dt * out[_V]
+        out[_RESETS + 2] = north - out[_P + 1] - dt * out[_V + 1]
     if vertical != out[_VERTICAL_RESETS]:
         out[_VERTICAL_RESETS] = vertical
-        out[_VERTICAL_RESETS + 1] = up - out[_P + 2]
+        out[_VERTICAL_RESETS + 1] = up - out[_P + 2] - dt * out[_V + 2]
 
 
 @kernel
@@ -371,10 +376,7 @@ def write_status(x, out):
 
 
 @kernel
-def receive(
-    x, p, origin, by_validity, imu, gnss, barometer, magnetometer, ranging, vision, vehicle_status,
-    estimate,
-):  # fmt: skip
+def receive(x, p, by_validity, imu, gnss, barometer, magnetometer, ranging, vision, vehicle_status):
     """Take all messages that have arrived; true if a filter step is due.
 
     Needed only on ticks that complete a filter step: what arrived earlier than this IMU
@@ -384,21 +386,18 @@ def receive(
     ----------
     x, p : np.ndarray
         The filter and its parameters.
-    origin : np.ndarray
-        Latitude, longitude (rad) and altitude (m) of W's origin, shape (3,).
     by_validity : bool
         As in `take_measurements`.
     imu, gnss, barometer, magnetometer, ranging, vision, vehicle_status : np.ndarray
         The messages in the ports; size 0 if the port is not connected.
-    estimate : np.ndarray
-        `VEHICLE_ESTIMATE`, changed in place.
     """
     row = np.empty(24)
     take_measurements(
         x, p, row, by_validity, imu[TIME_OF_ARRIVAL],
         gnss, barometer, magnetometer, ranging, vision,
     )  # fmt: skip
-    receive_imu(x, p, origin, imu, vehicle_status, estimate)
+    take_imu(x, p, row, imu)
+    _take_status(x, p, row, vehicle_status)
     take_measurements(
         x, p, row, by_validity, math.inf, gnss, barometer, magnetometer, ranging, vision
     )
@@ -417,10 +416,10 @@ def receive_imu(x, p, origin, imu, vehicle_status, estimate):
 
 
 @kernel
-def write_step(x, p, origin, estimate):
-    """Write the estimate after a filter step."""
-    write_resets(x, p, origin, estimate)
-    write_motion(x, p, origin, estimate)
+def write_step(x, p, origin, out):
+    """Write `VEHICLE_ESTIMATE` after a filter step."""
+    write_resets(x, p, origin, out)
+    write_motion(x, p, origin, out)
 
 
 @kernel

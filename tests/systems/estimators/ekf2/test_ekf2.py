@@ -191,7 +191,7 @@ def test_replay_through_drake_is_the_plain_replay():
     run.simulator.AdvancePendingEvents()
     drake = run.array
     own = np.zeros(plain.size, dtype=bool)
-    own[at.ARRIVED : at.ARRIVED + 10] = True  # the ports' own book-keeping
+    own[at.ARRIVED : at.STATUS_SENT + 4] = True  # the ports' own book-keeping
     own[at.T_IN_AIR] = True  # the status says "in the air" from the start here
     own[int(plain[at.RING_STATUS + at.RING_DATA]) :] = True
     own[at.RING_STATUS : at.FIXED_SIZE] = True
