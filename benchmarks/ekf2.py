@@ -8,6 +8,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import AffineSystem
 
+from runs.replay import play
+from runs.simulated_log import Rates, simulated_log
 from systems.estimators.ekf2 import filter as kernels
 from systems.estimators.ekf2 import parameters as prm
 from systems.estimators.ekf2.ekf2 import Ekf2Config
@@ -107,11 +109,26 @@ def drake_step_cost(with_filter: bool = True) -> float:
     return _best(run)
 
 
+def replay_cost() -> float:
+    """CPU seconds of the replay of a stream of `SECONDS`, after start-up."""
+    samples, _ = simulated_log(seed=0, seconds=SECONDS, rates=Rates(vision=10.0))
+    p = prm.parameter_array({"EKF2_DELAY_MAX": 300, "EKF2_EV_CTRL": 3, "EKF2_EV_DELAY": 200})
+
+    def run() -> float:
+        begin = time.process_time()
+        play(samples, p)
+        return time.process_time() - begin
+
+    run()
+    return _best(run)
+
+
 def main() -> None:
     """Print the table."""
     block = drake_step_cost() - drake_step_cost(with_filter=False)
     print(f"EKF2 kernels, 250 Hz IMU:   {kernel_step_cost():6.1f} us CPU a filter step")
     print(f"EKF2 block in Drake:        {block:6.1f} us CPU a filter step")
+    print(f"EKF2 replay of {SECONDS:.0f} s:        {1e3 * replay_cost():6.1f} ms CPU")
 
 
 if __name__ == "__main__":

@@ -55,6 +55,11 @@ class Blocks:
         self.systems[path] = config.add_to(builder, name, self.seed_of(path), **options)
         return self.systems[path]
 
+    def keep(self, path: str, system: System) -> None:
+        """Remember a system that was built elsewhere from the configuration at `path`."""
+        self._kinds[path] = type(at_path(self.scenario, path))
+        self.systems[path] = system
+
     def configure(self, scenario: Any) -> None:
         """Give every block its configuration and seed from `scenario`.
 

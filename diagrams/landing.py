@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from diagrams.blocks import Blocks
+from diagrams.navigation import add_navigation
 from diagrams.recording import Recording
 from diagrams.scenario import MultirotorLanding, settled
 from diagrams.sensors import sensors
@@ -36,6 +37,8 @@ from systems.vision.svgs_drawing import draw_svgs_detection
 
 MEASUREMENTS = (
     "imu",
+    "imu_2",
+    "imu_3",
     "gnss",
     "barometer",
     "magnetometer",
@@ -77,7 +80,7 @@ class LandingDiagram:
         builder = DiagramBuilder()
         self.world = builder.AddSystem(world(self.blocks))
         self.sensors = builder.AddSystem(sensors(self.blocks))
-        self.navigation = self.blocks.add(builder, "navigation", "navigation")
+        self.navigation = add_navigation(self.blocks, builder)
         self.target = self.blocks.add(builder, "landing_target", "landing target")
         self.guidance = self.blocks.add(builder, "guidance", "guidance")
         self.control = self.blocks.add(builder, "control", "control")
@@ -145,6 +148,8 @@ class LandingDiagram:
             if self.sensors.HasOutputPort(name):
                 ports[name] = self.sensors.GetOutputPort(name)
         ports["estimate"] = self.navigation.GetOutputPort("estimate")
+        if self.navigation.HasOutputPort("instance"):
+            ports["instance"] = self.navigation.GetOutputPort("instance")
         if self.target is not None:
             ports["target_measurement"] = self.target.GetOutputPort("measurement")
             ports["target"] = self.target.GetOutputPort("target")
@@ -186,6 +191,7 @@ class LandingDiagram:
             "wind": (["v_W_x", "v_W_y", "v_W_z"], slow),
             "pad": (PAD_STATE, slow),
             "estimate": (VEHICLE_ESTIMATE, slow),
+            "instance": (["selected", "changed"], slow),
             "target": (TARGET_ESTIMATE, slow),
             "setpoint": (SETPOINT, slow),
             "supervisor": (SUPERVISOR_STATUS, slow),

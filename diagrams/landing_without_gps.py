@@ -2,25 +2,39 @@
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pandas as pd
 from pydantic import Field
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from diagrams.recording import Recording
 from plants.fixed_wing import FixedWing, FixedWingConfig
+from plants.fixed_wing_dynamics import equilibrium_pitch
 from plants.recorded_flight import RecordedFlight, RecordedFlightConfig
 from plants.terrain import FlatTerrain, Terrain
-from systems.configuration import StructureChangedError, configuration, require_same_structure
+from systems.configuration import (
+    Positive,
+    StructureChangedError,
+    configuration,
+    require_same_structure,
+)
 from systems.controllers.fixed_wing_flight_controller import FixedWingFlightControllerConfig
-from systems.controllers.fixed_wing_guidance import RouteConfig
+from systems.controllers.fixed_wing_guidance import RouteConfig, landing_altitude
 from systems.controllers.fixed_wing_reference_flight import reference_flight
 from systems.estimators.runway_error_filter import FILTER_INPUTS, RunwayErrorFilterConfig
 from systems.estimators.runway_improved_filter import RunwayImprovedFilterConfig
-from systems.estimators.runway_record import RunwayRecordConfig
-from systems.runway_frames import RunwayConfig
+from systems.estimators.runway_record import END, RunwayRecordConfig
+from systems.runway_frames import (
+    RunwayConfig,
+    bearing_and_elevation,
+    direction_in_camera,
+    ned_from_runway,
+    pixel_from_angles,
+)
 from systems.sensors.runway_airspeed import RunwayAirspeedConfig
 from systems.sensors.runway_antenna import RunwayAntennaConfig
 from systems.sensors.runway_baro_inertial import RunwayBaroInertialConfig
-from systems.sensors.runway_camera import RunwayCameraConfig
+from systems.sensors.runway_camera import RunwayCameraConfig, camera_parameters
 from systems.sensors.runway_gps import RunwayGpsConfig
 from systems.sensors.runway_heading import RunwayHeadingConfig
 from systems.sensors.runway_inertial_drift import RunwayInertialDriftConfig
@@ -28,7 +42,22 @@ from systems.sensors.runway_laser import RunwayLaserConfig
 from systems.sensors.runway_pixel_camera import RunwayPixelCameraConfig
 from systems.sensors.runway_tracker import RunwayTrackerConfig
 from systems.sensors.runway_wheel_encoder import RunwayWheelEncoderConfig
-from systems.supervisors.runway_phases import RunwayPhasesConfig
+from systems.signals.noise import stream_key
+from systems.signals.runway_measurement import (
+    ANTENNA,
+    FIX,
+    FIXED_WING_COMMAND,
+    FIXED_WING_STATE,
+    GUIDANCE,
+    LASER_HEIGHT,
+    NAVIGATION_ESTIMATE,
+    PHASE_STATUS,
+    PICTURE,
+    SLOW_PERIOD,
+)
+from systems.supervisors.runway_phases import TABLE, Phase, RunwayPhasesConfig
+from systems.supervisors.state_machine import to_dot
+from systems.vision.runway_picture import draw_picture, draw_tracked_point
 
 OUTPUTS = ("state", "estimate", "phase", "guidance", "command", "passages", "end")
 
@@ -39,8 +68,9 @@ class LandingWithoutGpsScenario:
 
     kind: Literal["landing_without_gps"] = "landing_without_gps"
     name: str = "landing_without_gps"
-    seed: int = 0
-    duration: float = 1800.0  # s, the end if the aircraft has not come to rest by then
+    description: str = ""
+    seed: Annotated[int, Field(ge=0)] = 0  # of all noise and of every error drawn once a run
+    time_limit: Positive = 1800.0  # s, the end if the aircraft has not come to rest by then
     runway: RunwayConfig = Field(default_factory=RunwayConfig)
     terrain: Terrain = Field(default_factory=FlatTerrain)
     # a recorded flight makes it an open loop (5.2)
@@ -49,11 +79,16 @@ class LandingWithoutGpsScenario:
     )
     inertial: RunwayInertialDriftConfig = Field(default_factory=RunwayInertialDriftConfig)
     baro: RunwayBaroInertialConfig = Field(default_factory=RunwayBaroInertialConfig)
-    # On final from the start: one fix, with the spread that the return leaves. The thesis calls
-    # its own initial errors "a bit optimistic, especially on the speed" (6.1).
+    # On final from the start: one fix, with the spread that the return leaves and what the filter
+    # believes of it. The speed is what a gyro of 0.033 deg/h drifts in the twelve minutes since the
+    # loss, R_T D (1 − cos ω_S t); the thesis's filter holds its speed error constant meanwhile
     gps: RunwayGpsConfig = Field(
         default_factory=lambda: RunwayGpsConfig(
-            horizontal_noise=50.0, vertical_noise=5.0, speed_noise=0.2
+            horizontal_noise=50.0,
+            vertical_noise=5.0,
+            speed_noise=0.4,
+            reported_horizontal_accuracy=25.0,
+            reported_speed_accuracy=0.04,
         )
     )
     antenna: RunwayAntennaConfig = Field(default_factory=RunwayAntennaConfig)
@@ -85,16 +120,28 @@ class LandingWithoutGpsDiagram:
         With the output ports `OUTPUTS`.
     systems : dict
         Every system by its name in the diagram.
+    ports : dict
+        Output ports by their name in the log.
+    recording : Recording
+        What is recorded of them, every 80 ms.
+
+    Raises
+    ------
+    ValueError
+        For a terrain or a flight that cannot be read, and for a camera that never sees the
+        touch-down point.
     """
 
     def __init__(self, scenario: LandingWithoutGpsScenario):
+        require_sight(scenario)
         self._scenario = scenario
         builder = DiagramBuilder()
         seed, runway, terrain = scenario.seed, scenario.runway, scenario.terrain
         aircraft: FixedWing | RecordedFlight
+        self._flights: dict[str, pd.DataFrame] = {}
         if isinstance(scenario.aircraft, RecordedFlightConfig):
             aircraft = scenario.aircraft.add_to(
-                builder, "aircraft", seed, runway, terrain, _flight(scenario)
+                builder, "aircraft", seed, runway, terrain, self._flight(scenario)
             )
             recorded = aircraft.recorded_sensors
             seen = "seen_state"
@@ -109,6 +156,9 @@ class LandingWithoutGpsDiagram:
         for name in (*simulated.values(), *_WITH_RUNWAY):
             self.systems[name] = getattr(scenario, name).add_to(builder, name, seed, runway)
         self.systems["phases"] = scenario.phases.add_to(builder, "phases", seed)
+        self.systems["record"] = scenario.record.add_to(
+            builder, "record", seed, runway, scenario.time_limit
+        )
         if isinstance(scenario.camera, RunwayPixelCameraConfig) and drawn:
             self.systems["camera"] = scenario.camera.add_to(
                 builder, "camera", seed, runway, scenario.tracker
@@ -152,6 +202,11 @@ class LandingWithoutGpsDiagram:
             connect("camera", state="seen_state")
         for name in OUTPUTS:
             builder.ExportOutput(port[name], name)
+        self.ports: dict[str, OutputPort] = port
+        self.recording = Recording()
+        for name, layout in RECORDED.items():
+            self.recording.add(port[name], name, layout, SLOW_PERIOD)
+        self.recording.connect(builder)
         self.diagram: Diagram = builder.Build()
         self.diagram.set_name("landing_without_gps")
 
@@ -167,13 +222,16 @@ class LandingWithoutGpsDiagram:
         ------
         StructureChangedError
             Where the diagram would have to be built anew.
+        ValueError
+            As the constructor does.
         """
+        require_sight(scenario)
         for name in ("aircraft", "filter", "camera"):
             require_same_structure(getattr(self._scenario, name), getattr(scenario, name), "kind")
         aircraft, seed, runway = self.systems["aircraft"], scenario.seed, scenario.runway
         site = (runway, scenario.terrain)
         if isinstance(scenario.aircraft, RecordedFlightConfig):
-            aircraft.configure(scenario.aircraft, seed, *site, _flight(scenario))
+            aircraft.configure(scenario.aircraft, seed, *site, self._flight(scenario))
             if aircraft.recorded_sensors != self._recorded:
                 raise StructureChangedError(
                     f"{scenario.aircraft.path} holds other sensors than the flight that the "
@@ -184,20 +242,111 @@ class LandingWithoutGpsDiagram:
         for name, system in self.systems.items():
             if isinstance(scenario.camera, RunwayPixelCameraConfig) and name == "camera":
                 system.configure(scenario.camera, seed, runway, scenario.tracker)
-            elif name not in ("aircraft", "phases"):
+            elif name not in ("aircraft", "phases", "record"):
                 system.configure(getattr(scenario, name), seed, runway)
         self.systems["phases"].configure(scenario.phases, seed)
+        self.systems["record"].configure(scenario.record, seed, runway, scenario.time_limit)
         self._scenario = scenario
 
+    def _flight(self, scenario: LandingWithoutGpsScenario) -> pd.DataFrame | None:
+        """The reference flight, where the scenario replays it; None where it names a file."""
+        aircraft = scenario.aircraft
+        assert isinstance(aircraft, RecordedFlightConfig)
+        if aircraft.path:
+            return None
+        flown = (
+            scenario.flight_controller, scenario.runway, scenario.terrain, aircraft.flight_seed
+        )  # fmt: skip
+        key = repr(flown)
+        if key not in self._flights:
+            self._flights[key] = reference_flight(*flown)
+        return self._flights[key]
 
-def _flight(scenario: LandingWithoutGpsScenario) -> pd.DataFrame | None:
-    """The reference flight, where the scenario replays it; None where it names a file."""
+    def evaluate(self, name: str, context: Context) -> np.ndarray:
+        """The value of the port called `name` in the root context."""
+        port = self.ports[name]
+        return port.Eval(port.get_system().GetMyContextFromRoot(context))
+
+    def state(self, context: Context) -> str:
+        """The phase, in words."""
+        return self.state_names()[int(self.evaluate("phase", context)[0])].replace("_", " ")
+
+    def state_names(self) -> list[str]:
+        """The names of the phases, by index."""
+        return [state.name for state in TABLE.states]
+
+    def states_dot(self) -> str:
+        """The transition table of the phases as DOT text."""
+        return to_dot(TABLE, "phases", self.systems["phases"])
+
+    def is_landing(self, context: Context) -> bool:
+        """Whether the camera's picture matters: from the final to the touchdown."""
+        return Phase.FINAL <= self.evaluate("phase", context)[0] < Phase.BRAKING
+
+    def camera_pictures(self, context: Context) -> list[tuple[str, np.ndarray]]:
+        """What the camera sees now with the tracked point drawn in, BGR; drawn on demand."""
+        camera, runway = self._scenario.camera, self._scenario.runway
+        state = np.array(self.evaluate("seen_state", context))
+        parameters = camera_parameters(camera, self._scenario.seed)
+        image = draw_picture(
+            state[:3],
+            state[6:9],
+            parameters[4:7],
+            parameters[7:10],
+            parameters[:4],
+            np.array([runway.heading_radians, runway.width, runway.length]),
+            (0, 0),
+            (int(camera.rows), int(camera.columns)),
+            _GRAIN,
+            stream_key(self._scenario.seed, "runway_pixel_camera.grain"),
+            round(context.get_time() / SLOW_PERIOD),
+        )
+        distance = float(np.hypot(state[0], state[1]))
+        tracked = PICTURE(self.evaluate("picture", context))
+        point = (tracked.u, tracked.v) if tracked.valid > 0.0 else None
+        return [("camera", draw_tracked_point(image, point, f"{distance:.0f} m to go"))]
+
+
+def require_sight(scenario: LandingWithoutGpsScenario) -> None:
+    """Be sure that the camera sees the touch-down point somewhere on the landing trajectory.
+
+    Raises
+    ------
+    ValueError
+        Says where the point would lie in the picture.
+    """
+    camera, runway, tracker = scenario.camera, scenario.runway, scenario.tracker
+    controller = scenario.flight_controller
+    profile = controller.route.profile.vector(controller.speed, controller.gear)
     aircraft = scenario.aircraft
-    assert isinstance(aircraft, RecordedFlightConfig)
-    if aircraft.path:
-        return None
-    return reference_flight(
-        scenario.flight_controller, scenario.runway, scenario.terrain, aircraft.flight_seed
+    if isinstance(aircraft, RecordedFlightConfig):
+        aircraft = FixedWingConfig()  # its recording may be of any; the trim is about the same
+    optics = camera.optics()
+    far, near = max(tracker.clicks), max(tracker.loss_distance, 1.0)
+    if far <= near:
+        raise ValueError(
+            f"tracker.clicks: expected a click farther than tracker.loss_distance ({near:g} m), "
+            "or the tracker never has the touch-down point"
+        )
+    for distance in np.linspace(far, near, 40):
+        altitude, slope = landing_altitude(distance, profile)
+        pitch = equilibrium_pitch(
+            aircraft.speed, slope * aircraft.speed, aircraft.pitch_a, aircraft.pitch_b
+        )
+        heading = runway.heading_radians
+        p_n = ned_from_runway(np.array([0.0, -distance, -altitude]), heading)
+        p_c = direction_in_camera(
+            p_n, heading, pitch, 0.0, np.array(camera.position), camera.mounting_radians()
+        )
+        bearing, elevation = bearing_and_elevation(p_c)
+        u, v = pixel_from_angles(bearing, elevation, optics)
+        if p_c[0] > 0.0 and 0.0 <= u < camera.columns and 0.0 <= v < camera.rows:
+            return
+    where = f"at ({u:.0f}, {v:.0f}) px" if p_c[0] > 0.0 else "behind it"
+    raise ValueError(
+        "camera.mounting: expected a camera that sees the touch-down point on the landing "
+        f"trajectory, but there the point lies {where}, and the picture has "
+        f"{camera.columns:g} x {camera.rows:g} px"
     )
 
 
@@ -213,4 +362,18 @@ _MEASUREMENTS = {
     "wheel_speed": "wheel_encoder",
     "airspeed": "airspeed",
 }
-_WITH_RUNWAY = ("filter", "flight_controller", "record")
+_WITH_RUNWAY = ("filter", "flight_controller")
+# what goes into the log; a measurement that comes faster than it is recorded is thinned out
+RECORDED = {
+    "state": FIXED_WING_STATE,
+    "estimate": NAVIGATION_ESTIMATE,
+    "phase": PHASE_STATUS,
+    "guidance": GUIDANCE,
+    "command": FIXED_WING_COMMAND,
+    "end": END,
+    "fix": FIX,
+    "antenna": ANTENNA,
+    "picture": PICTURE,
+    "laser": LASER_HEIGHT,
+}
+_GRAIN = 2.0  # grey levels, one sigma, of the pictures in the report

@@ -5,6 +5,7 @@ A scenario file is YAML with the fields of a scenario dataclass; `kind` says whi
 Overrides are dotted paths: ``wind.speed=5``, ``sensors.gnss.sensor.kind=rtk``.
 """
 
+import copy
 import difflib
 import io
 import math
@@ -185,7 +186,8 @@ def _set_path(source: str, tree: dict[str, Any], path: str, value: Any) -> None:
         else:
             raise ScenarioError(f"{source}: {path}: {'.'.join(keys[:depth])} has no fields")
         if last:
-            node[index] = _merge(node[index], value) if _has(node, index) else value
+            own = copy.deepcopy(value)  # later paths write into it, and must not into the caller's
+            node[index] = _merge(node[index], own) if _has(node, index) else own
         else:
             node = node[index]
 

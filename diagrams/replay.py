@@ -5,7 +5,6 @@ every step of the simulator, and the simulator makes one step to every time of a
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -20,6 +19,7 @@ from systems.estimators.ekf2 import filter as kernels
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import messages
 from systems.estimators.ekf2.ekf2 import Ekf2, Ekf2Config
+from systems.estimators.ekf2.warm_start import Start, with_start
 from systems.sensors.log_playback import IN_AIR, VEHICLE_FLAGS, LogPlayback
 from systems.signals.measurement import TIME_OF_ARRIVAL, TIME_OF_VALIDITY
 from systems.signals.sensor_log import SensorLog
@@ -81,22 +81,25 @@ class ReplayEkf2(Ekf2):
         Its parameters are replaced.
     parameters : np.ndarray
         As the kernels read them.
+    start : Start, optional
+        The state to start from.
     """
 
-    def __init__(self, config: Ekf2Config, parameters: np.ndarray):
-        self._replayed_parameters = parameters
+    def __init__(self, config: Ekf2Config, parameters: np.ndarray, start: Start | None = None):
+        self._replayed = parameters, start
         super().__init__(config)
         self.DeclareVectorInputPort("vehicle_flags", VEHICLE_FLAGS.size)
         self.DeclareVectorInputPort("in_air", IN_AIR.size)
 
-    def DeclarePeriodicDiscreteUpdateEvent(self, period: float, offset: float, update: Any) -> None:
-        """A log has its own times: the update runs at every step instead."""
-        self.DeclarePerStepDiscreteUpdateEvent(update)
+    def _declare_update(self) -> None:
+        self.DeclarePerStepDiscreteUpdateEvent(self._update)  # a log has its own times
 
     def _configure(self, config: Ekf2Config) -> None:
         super()._configure(config)
-        self._parameters = self._replayed_parameters
+        self._parameters, start = self._replayed
         self._initial = kernels.initialise(self._parameters)
+        if start is not None:
+            self._initial = with_start(self._initial, start)
         self._row = np.empty(24)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -132,6 +135,8 @@ class ReplayDiagram:
         Of the filter.
     gnss_delay : float
         us, taken off the stamps of GNSS samples.
+    start : Start, optional
+        The state to start from; by default the filter starts anew.
 
     Raises
     ------
@@ -139,12 +144,18 @@ class ReplayDiagram:
         If the ports cannot carry the log, see `LogPlayback`.
     """
 
-    def __init__(self, samples: SensorLog, parameters: np.ndarray, gnss_delay: float = 0.0):
+    def __init__(
+        self,
+        samples: SensorLog,
+        parameters: np.ndarray,
+        gnss_delay: float = 0.0,
+        start: Start | None = None,
+    ):
         origin = samples.origin()
         config = Ekf2Config() if origin is None else Ekf2Config(origin=[*map(float, origin)])
         builder = DiagramBuilder()
         self.playback = builder.AddNamedSystem("log", LogPlayback(samples, gnss_delay))
-        self.ekf2 = builder.AddNamedSystem("ekf2", ReplayEkf2(config, parameters))
+        self.ekf2 = builder.AddNamedSystem("ekf2", ReplayEkf2(config, parameters, start))
         for name in (*_SENSORS, "vehicle_flags", "in_air"):
             source, sink = self.playback.GetOutputPort(name), self.ekf2.GetInputPort(name)
             builder.Connect(source, sink)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from diagrams.blocks import at_path
+from diagrams.landing_without_gps import LandingWithoutGpsScenario
 from plants.multirotor import MultirotorConfig
 from plants.pads import PadConfig
 from plants.touchdown import TouchdownConfig
@@ -20,7 +21,9 @@ from systems.controllers.multirotor_cascade import MultirotorCascadeConfig
 from systems.data_recorder import DataRecorderConfig
 from systems.estimators.ardupilot_target import ArduPilotTargetConfig
 from systems.estimators.ekf2.ekf2 import Ekf2Config
-from systems.estimators.px4_target import PX4TargetConfig
+from systems.estimators.ekf2_selector import Ekf2SelectorConfig
+from systems.estimators.multi_hypothesis_target import MultiHypothesisTargetConfig
+from systems.estimators.px4_target import PX4TargetConfig, PX4VisionTargetConfig
 from systems.estimators.svgs_companion import SvgsCompanionConfig
 from systems.schedule import CLOCK_PERIOD, on_grid
 from systems.sensors.barometer import BarometerConfig
@@ -33,6 +36,7 @@ from systems.sensors.range_finder import RangeFinderConfig
 from systems.sensors.svgs_camera import SvgsCameraConfig
 from systems.signals.delay_line import DelayLineConfig, UniformLatency
 from systems.signals.fault_injector import FaultInjectorConfig
+from systems.supervisors.cone import ConeConfig
 from systems.supervisors.landing_supervisor import LandingSupervisorConfig
 
 
@@ -52,7 +56,7 @@ class GnssChannel:
     sensor: GnssConfig = Field(default_factory=GnssConfig)
     faults: FaultInjectorConfig | None = None  # null: no injector, and no commands to it
     latency: DelayLineConfig = Field(  # s; PX4's EKF2_GPS_DELAY assumes 0.11
-        default_factory=lambda: DelayLineConfig(processing=0.11, period=0.032)
+        default_factory=lambda: DelayLineConfig(processing=0.11, period=0.04)
     )
 
 
@@ -98,6 +102,8 @@ class Sensors:
     """Every sensor on board; a channel that is null is not there."""
 
     imu: ImuConfig = Field(default_factory=ImuConfig)
+    imu_2: ImuConfig | None = None  # for a second navigation filter, see `selector`
+    imu_3: ImuConfig | None = None
     gnss: GnssChannel | None = Field(default_factory=GnssChannel)
     barometer: BarometerConfig | None = Field(default_factory=BarometerConfig)
     magnetometer: MagnetometerConfig | None = Field(default_factory=MagnetometerConfig)
@@ -108,7 +114,12 @@ class Sensors:
 
 
 LandingTargetConfig = Annotated[
-    ArduPilotTargetConfig | PX4TargetConfig | SvgsCompanionConfig, Field(discriminator="kind")
+    ArduPilotTargetConfig
+    | PX4TargetConfig
+    | PX4VisionTargetConfig
+    | MultiHypothesisTargetConfig
+    | SvgsCompanionConfig,
+    Field(discriminator="kind"),
 ]
 
 
@@ -116,9 +127,9 @@ LandingTargetConfig = Annotated[
 class RecordingConfig:
     """What goes into the log, how often."""
 
-    # s; measurements that come faster than every 32 ms are looked for twice as often
-    period: Annotated[float, AfterValidator(on_grid)] = 0.032
-    imu: bool = False  # every 8 ms, so that the log can be replayed through a filter
+    # s; measurements that come faster than every 40 ms are looked for twice as often
+    period: Annotated[float, AfterValidator(on_grid)] = 0.04
+    imu: bool = False  # every 10 ms, so that the log can be replayed through a filter
 
 
 @configuration
@@ -138,6 +149,8 @@ class MultirotorLanding:
     pad: PadConfig = Field(default_factory=PadConfig)
     sensors: Sensors = Field(default_factory=Sensors)
     navigation: Ekf2Config = Field(default_factory=Ekf2Config)
+    # Several filters, each on an inertial sensor of its own (imu, imu_2, imu_3); null: one filter
+    selector: Ekf2SelectorConfig | None = None
     landing_target: LandingTargetConfig | None = Field(default_factory=ArduPilotTargetConfig)
     guidance: LandingSupervisorConfig = Field(default_factory=LandingSupervisorConfig)
     control: MultirotorCascadeConfig = Field(default_factory=MultirotorCascadeConfig)
@@ -146,7 +159,10 @@ class MultirotorLanding:
     data_recorder: DataRecorderConfig | None = None  # a companion computer's own record, as CSV
 
 
-SCENARIO_KINDS: dict[str, type] = {"multirotor_landing": MultirotorLanding}
+SCENARIO_KINDS: dict[str, type] = {
+    "multirotor_landing": MultirotorLanding,
+    "landing_without_gps": LandingWithoutGpsScenario,
+}
 
 
 def settled(scenario: MultirotorLanding) -> MultirotorLanding:
@@ -191,6 +207,9 @@ def _shared(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
         ("sensors.barometer.origin_altitude", s.origin.altitude, "origin.altitude"),
         ("sensors.barometer.vehicle_mass", vehicle.mass, "vehicle"),
     ]
+    if isinstance(s.guidance.routine, ConeConfig):
+        feet = min(foot[2] for foot in vehicle.feet)
+        shared.append(("guidance.routine.feet_height", feet, "vehicle"))
     cameras = s.sensors.marker_camera, s.sensors.infrared_camera
     for name, camera in zip(("marker", "infrared"), cameras, strict=True):
         sensor = f"sensors.{name}_camera.sensor"

@@ -21,15 +21,15 @@ CAMERAS = (
     ("infrared", "sensors.infrared_camera", INFRARED),
     ("svgs", "sensors.svgs_camera", SVGS),
 )
-DIRECT = ("imu", "barometer", "magnetometer", "range_finder")
+DIRECT = ("imu", "imu_2", "imu_3", "barometer", "magnetometer", "range_finder")
 
 
 def sensors(blocks: Blocks) -> Diagram:
     """The sensors.
 
     Exports the inputs `body`, `pad`, `supervisor`, `fault_command` and one output a
-    sensor that the scenario has: `imu`, `gnss`, `barometer`, `magnetometer`,
-    `range_finder`, `marker`, `infrared`, `svgs`.
+    sensor that the scenario has: `imu`, `imu_2`, `imu_3`, `gnss`, `barometer`,
+    `magnetometer`, `range_finder`, `marker`, `infrared`, `svgs`.
     """
     builder = DiagramBuilder()
     shared = _SharedInputs(builder)

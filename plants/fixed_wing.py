@@ -163,6 +163,11 @@ class FixedWing(LeafSystem):
             self._grid.geometry,
         )
 
+    @property
+    def model(self) -> tuple:
+        """Initial state and memory, parameters, noise key, and the terrain's grid."""
+        return *self._initial, self._parameters, self._key, self._grid
+
     def _initialize(self, context, discrete_state):
         # Drake fixes the default state when a system is built; an aircraft without airspeed is
         # one that has not been placed yet.

@@ -1,6 +1,6 @@
 """The multirotor as a Drake system: fast and discrete, or continuous for every scalar type.
 
-`Multirotor` is what runs: one discrete event every 8 ms around the compiled
+`Multirotor` is what runs: one discrete event every 10 ms around the compiled
 kernel of `plants.multirotor_dynamics`. `ContinuousMultirotor_` writes the same
 free flight down once more for float, AutoDiffXd and Expression, to linearise,
 to design controllers with, and to hold the kernel against.
@@ -130,10 +130,10 @@ class Multirotor(LeafSystem):
     | event | when | what |
     |---|---|---|
     | initialize | at the start | the initial state of the last `configure` |
-    | step | every 8 ms from 0 | RK4 from t to t + 8 ms with the inputs at t |
+    | step | every 10 ms from 0 | RK4 from t to t + 10 ms with the inputs at t |
 
     So a block that samples at t sees the body at t, and in it the mean specific
-    force from t − 8 ms to t. The same equations for other scalar types are in
+    force from t − 10 ms to t. The same equations for other scalar types are in
     `ContinuousMultirotor_`.
     """
 

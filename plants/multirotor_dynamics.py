@@ -81,7 +81,7 @@ from systems.schedule import PLANT_PERIOD
 ) = range(25)
 
 BODY_SIZE = 13  # q_WB, p_WB, v_WB, w_WB_B
-STEP = PLANT_PERIOD  # s, 8 ms, the step that `step` makes
+STEP = PLANT_PERIOD  # s, 10 ms, the step that `step` makes
 # RK4's stability limit is 2.78/h. In flight the fastest rate is the rotors' (80 1/s). In contact it
 # is friction's, μ N / (v_s m) with the legs' lever arms: some 3 000 1/s at rest and several times
 # that in a hard touchdown, so h = 0.25 ms (limit 11 000 1/s).
@@ -364,7 +364,7 @@ def integrate(body, rotor_speeds, commands, wind, pad, parameters, duration, sub
 
 @njit(cache=True, error_model="numpy")
 def step(body, rotor_speeds, commands, wind, pad, parameters):
-    """Advance `body` (17,) and `rotor_speeds` (N,) in place by one plant step of 8 ms.
+    """Advance `body` (17,) and `rotor_speeds` (N,) in place by one plant step of 10 ms.
 
     RK4 in 2 sub-steps in flight and in 32 where a contact point may touch; a
     vehicle that is `at_rest` stays where it is. Parameters as in `integrate`.

@@ -115,6 +115,7 @@ class RecordedFlightConfig:
     # m, by which the recorded altitude is too high: "probably a bias in the altitude
     # considered as the real altitude", taken out by a correction of 4 m (6.1, Table 6)
     altitude_error: Finite = 0.0
+    start_distance: Metres = 0.0  # m, the replay begins this far from the point; 0: at the start
     gear: Metres = 1.2  # m, from the wheels up to the centre of gravity
 
     def add_to(
@@ -242,6 +243,15 @@ class RecordedFlight(LeafSystem):
             flight = read_flight(Path(config.path))
         if flight is None:
             raise ValueError("RecordedFlightConfig.path: expected a file, or a flight as a table")
+        if config.start_distance > 0.0:
+            near = np.hypot(flight["north"], flight["east"]) <= config.start_distance
+            if near.sum() < 2:
+                raise ValueError(
+                    f"{config.path or 'the reference flight'}: expected a flight that comes within "
+                    f"{config.start_distance:g} m of the touch-down point (start_distance)"
+                )
+            flight = flight.iloc[int(np.argmax(near)) :].reset_index(drop=True)
+            flight["time"] -= flight["time"].iloc[0]
         samples = flight[list(FLIGHT_COLUMNS)].to_numpy(dtype=float)
         rates = np.gradient(samples[:, 7:10], samples[:, 0], axis=0)
         self._samples = np.ascontiguousarray(np.hstack((samples, rates)))
@@ -262,6 +272,11 @@ class RecordedFlight(LeafSystem):
     def duration(self) -> float:
         """The length of the recording, s."""
         return float(self._samples[-1, 0])
+
+    @property
+    def model(self) -> tuple:
+        """Samples of the flight, error of its altitude (m), height of its gear (m), terrain."""
+        return self._samples, self._altitude_error, self._gear, self._grid
 
     def _interpolate(self, discrete_state, time):
         for group, error in ((0, self._altitude_error), (1, 0.0)):

@@ -39,7 +39,7 @@ _DISARMED = SUPERVISOR_STATUS.index("disarmed")
 _CONTACT_FORCE = BODY_STATE.index("contact_force")
 _THRUST = BODY_STATE.index("f_B_z")
 _LITTLE_THRUST = 3.0  # m/s2
-_LOOK_PERIOD = 8 * BASE_PERIOD  # s
+_LOOK_PERIOD = 16 * BASE_PERIOD  # s
 _FINISH_PERIOD = 64 * BASE_PERIOD  # s
 _NOTHING = EventStatus.DidNothing()
 _VERDICT, _MEMORY = range(2)  # groups of the discrete state
@@ -113,7 +113,7 @@ class TouchdownObserver(LeafSystem):
 
     A touchdown is the first contact after the feet were `airborne_height` up;
     going up again cancels it. Speeds are relative to the surface, from the last
-    look without contact (at most 16 ms before); the vertical one is carried on to
+    look without contact (at most 20 ms before); the vertical one is carried on to
     where the feet meet the surface. Time, speeds and tilt are those of first
     contact, the offset is the last seen: at rest where the run ends so.
     A vehicle that says it is disarmed, with stopped rotors above
@@ -121,8 +121,8 @@ class TouchdownObserver(LeafSystem):
 
     | event | when | what |
     |---|---|---|
-    | look | every 16 ms from 0 | one application of the rules to the states at t |
-    | finish | every 128 ms from 0 (publish) | ends the simulation once there is a verdict |
+    | look | every 40 ms from 0 | one application of the rules to the states at t |
+    | finish | every 160 ms from 0 (publish) | ends the simulation once there is a verdict |
     """
 
     def __init__(self, config: TouchdownConfig, seed: int = 0):
@@ -153,9 +153,9 @@ class TouchdownObserver(LeafSystem):
         fastest_rotor = math.inf
         disarmed = False
         # Off the ground with thrust (the usual case) the rotors turn: no need to look at them.
-        if body[_CONTACT_FORCE] > 0.0 or body[_THRUST] < _LITTLE_THRUST:
-            fastest_rotor = self._rotors(context).max()
-            disarmed = self._supervisor(context)[_DISARMED] > 0.5
+        if body.item(_CONTACT_FORCE) > 0.0 or body.item(_THRUST) < _LITTLE_THRUST:
+            fastest_rotor = max(self._rotors(context).tolist())
+            disarmed = self._supervisor(context).item(_DISARMED) > 0.5
         rules.judge(
             discrete_state.get_mutable_value(_VERDICT),
             discrete_state.get_mutable_value(_MEMORY),

@@ -1,4 +1,4 @@
-"""The judge's rules, compiled: what `plants.touchdown.TouchdownObserver` does every 16 ms."""
+"""The judge's rules, compiled: what `plants.touchdown.TouchdownObserver` does every 40 ms."""
 
 import math
 

@@ -92,7 +92,7 @@ class Wind(LeafSystem):
 
     | event | when | what |
     |---|---|---|
-    | update | every 32 ms from 0 | the wind for t + 32 ms, held from t on |
+    | update | every 40 ms from 0 | the wind for t + 40 ms, held from t on |
     """
 
     def __init__(self, config: WindConfig, seed: int = 0):

@@ -73,7 +73,7 @@ def land(
     from_: str | None,
     report: bool,
 ) -> None:
-    """Fly SCENARIO once, from take-off to touchdown.
+    """Fly SCENARIO once, to the touchdown.
 
     SCENARIO is a name from `plumbline scenarios` or a YAML file.
     """
@@ -95,16 +95,8 @@ def land(
         result = fly_and_report(loaded, folder, live=live, report=report)
     except ScenarioError as error:
         raise WrongInput(str(error)) from None
-    verdict = "Landed" if result.landed else "Not landed"
-    click.echo(f"{verdict}: {result.reason}")
-    if result.landed:
-        click.echo(
-            f"Landing error {100 * result.landing_error_m:.1f} cm, "
-            f"landing time {result.landing_time_s:.1f} s, "
-            f"touchdown at {result.touchdown_speed_m_s:.2f} m/s"
-        )
-    else:
-        click.echo(f"After {result.simulated_s:.1f} s and {result.attempts} attempts")
+    for sentence in result.sentences():
+        click.echo(sentence)
     click.echo(f"Report: {folder / 'report.html'}" if report else f"Run: {folder / 'run.json'}")
     sys.exit(0 if result.landed else 1)
 
@@ -130,10 +122,10 @@ def graph(
 
     from diagrams.graph import GraphError, wiring_dot, write_graph
     from diagrams.loading import ScenarioError
-    from runs.run import Laboratory
+    from runs.run import laboratory
 
     try:
-        built = Laboratory(loaded).landing
+        built = laboratory(loaded).landing
     except ScenarioError as error:
         raise WrongInput(str(error)) from None
     dot = built.states_dot() if states else wiring_dot(built.diagram, depth)
@@ -225,6 +217,13 @@ def study(
 @click.option("--params", "file", type=click.Path(path_type=Path), help="A QGroundControl file.")
 @click.option("--defaults", type=click.Choice(["module", "unit-test"]), default="module")
 @click.option(
+    "--start",
+    type=click.Choice(["warm", "cold"]),
+    default="warm",
+    show_default=True,
+    help="From the state of the filter on board when the log began, if it is logged; or anew.",
+)
+@click.option(
     "--sweep",
     metavar="NAME=FIRST:LAST:STEP",
     help="Try a parameter at many values and replay with the best.",
@@ -236,6 +235,7 @@ def replay(
     overrides: tuple[str, ...],
     file: Path | None,
     defaults: Any,
+    start: Any,
     sweep: str | None,
     report: bool,
 ) -> None:
@@ -246,7 +246,7 @@ def replay(
     from runs.replay_run import replay_and_report
 
     try:
-        sentences = replay_and_report(log, folder, overrides, file, defaults, sweep, report)
+        sentences = replay_and_report(log, folder, overrides, file, defaults, sweep, report, start)
     except ReplayError as error:
         raise WrongInput(str(error)) from None
     for sentence in sentences:

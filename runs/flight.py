@@ -9,22 +9,20 @@ from pydrake.systems.framework import Context
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from diagrams.loading import ScenarioError
 from runs.logs import write_log
-from runs.px4_topics import px4_topics
-from runs.replay_3d import live_view, meshcat
+from runs.presentation import PRESENTATIONS
+from runs.replay_3d import meshcat
 from runs.report import CameraStrip, write_report
-from runs.run import RunResult, laboratory
-from runs.ulog import write_ulog
+from runs.run import laboratory
 
 
-def fly_and_report(
-    scenario: Any, folder: Path, live: bool = False, report: bool = True
-) -> RunResult:
-    """Fly a scenario and write its run folder.
+def fly_and_report(scenario: Any, folder: Path, live: bool = False, report: bool = True) -> Any:
+    """Fly a scenario and write its run folder; returns its result.
 
     Parameters
     ----------
-    scenario : MultirotorLanding
+    scenario : MultirotorLanding or LandingWithoutGpsScenario
         What to fly.
     folder : Path
         An existing folder; files of an earlier run in it are replaced.
@@ -32,13 +30,21 @@ def fly_and_report(
         Show the flight in Meshcat while it happens, at real-time rate.
     report : bool
         Write `report.html`, with what the cameras saw.
+
+    Raises
+    ------
+    ScenarioError
+        If the scenario's parts do not fit together, or it has no live view.
     """
+    shown = PRESENTATIONS[scenario.kind]
+    if live and shown.live is None:
+        raise ScenarioError(f"--live: there is no live view of a {scenario.kind}")
     lab = laboratory(scenario)
     simulator = lab.start()
-    strip = CameraStrip(lab.landing)
-    if live:
+    strip = CameraStrip(lab.landing, shown.frame_period)
+    if live and shown.live is not None:
         simulator.set_target_realtime_rate(1.0)
-        simulator.set_monitor(live_view(lab.landing, scenario))
+        simulator.set_monitor(shown.live(lab.landing, scenario))
         Console().print(f"Live at {meshcat().web_url()}")
     with Progress(
         TextColumn("{task.description:16}"),
@@ -47,7 +53,7 @@ def fly_and_report(
         TimeElapsedColumn(),
         transient=True,
     ) as bar:
-        task = bar.add_task("taking off", total=scenario.time_limit, time=0.0)
+        task = bar.add_task("starting", total=scenario.time_limit, time=0.0)
 
         def progress(context: Context) -> None:
             time = context.get_time()
@@ -59,7 +65,8 @@ def fly_and_report(
         bar.update(task, completed=scenario.time_limit, description="writing")
         log = lab.log(simulator.get_context())
         write_log(log, folder / "log.parquet")
-        write_ulog(folder / "log.ulg", px4_topics(log), information={"sys_name": "Plumbline"})
+        if shown.write_logs is not None:
+            shown.write_logs(folder, log)
         write_json(folder / "run.json", result.summary())
         if report:
             write_report(folder / "report.html", lab.landing, result, log, strip.frames)

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 from pyulog import ULog
 
+from runs.on_board import OnBoard, read_estimate, read_start
+from runs.ulog_fields import Fields, MissingFieldError, Topic, sample_times
+from systems.estimators.ekf2.warm_start import Start
 from systems.signals import sensor_log as logs
 from systems.signals.sensor_log import SensorLog
 
@@ -26,26 +29,6 @@ Parameters = dict[str, int | float]
 
 class ReplayError(ValueError):
     """A log, or what was asked of it, cannot be replayed."""
-
-
-@dataclass(frozen=True)
-class OnBoard:
-    """What the vehicle's own filter estimated.
-
-    Attributes
-    ----------
-    attitude : np.ndarray
-        Time (us), quaternion FRD to NED, w first, shape (n, 5).
-    motion : np.ndarray
-        Time (us), velocity NED (m/s), position NED (m), shape (m, 7).
-    reference : np.ndarray
-        Latitude, longitude (deg), altitude (m) that each position is relative to; NaN where
-        there is none, shape (m, 3).
-    """
-
-    attitude: np.ndarray
-    motion: np.ndarray
-    reference: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -62,6 +45,9 @@ class FlightLog:
         The `EKF2_…` parameters of the flight.
     on_board : OnBoard or None
         The estimates of the flight.
+    start : Start or None
+        The state that the filter on board had when the log began, if it was aligned by then;
+        a replay starts from it.
     range_limits : tuple of float
         Shortest and longest range (m) of the range finder.
     notes : tuple of str
@@ -72,6 +58,7 @@ class FlightLog:
     samples: SensorLog
     parameters: Parameters = field(default_factory=dict)
     on_board: OnBoard | None = None
+    start: Start | None = None
     range_limits: tuple[float, float] = (0.1, 40.0)
     notes: tuple[str, ...] = ()
 
@@ -352,8 +339,6 @@ _ESTIMATED_FRAMES = {1: logs.LOCAL_NED, 2: logs.LOCAL_FRD, 3: logs.BODY_FRD}  # 
 _SHORT_READS = 1000
 _VISION_PERIOD_US = 100_000.0  # us, of interpolated observations: EKF2 needs 200 ms or less
 
-Topic = Mapping[str, np.ndarray]
-
 
 def _read_ulog(path: Path, data: bytes) -> FlightLog:
     name = str(path)
@@ -374,12 +359,13 @@ def _read_ulog(path: Path, data: bytes) -> FlightLog:
     try:
         with np.errstate(all="ignore"):
             samples, where = _ulog_samples(topics, parameters, notes)
-            on_board = _on_board(topics)
+            on_board = read_estimate(topics)
+            start = read_start(topics, samples.of(logs.IMU)[0])
             limits = _range_limits(topics)
-    except _MissingFieldError as error:
+    except MissingFieldError as error:
         raise ReplayError(f"{name}: {error}") from None
     return FlightLog(
-        path.name, _checked(samples, where, name), parameters, on_board, limits, tuple(notes)
+        path.name, _checked(samples, where, name), parameters, on_board, start, limits, tuple(notes)
     )
 
 
@@ -404,40 +390,6 @@ class _Bytes(io.BytesIO):
             if self._beyond > _SHORT_READS:
                 raise _CutError("it ends inside a message")
         return data
-
-
-class _MissingFieldError(ValueError):
-    pass
-
-
-class _Fields:
-    """The fields of one topic as float64, in order of time."""
-
-    def __init__(self, topics: Mapping[str, Topic], *names: str):
-        self.name = next((name for name in names if name in topics), names[0])
-        self._data = topics.get(self.name, {})
-        self._order = np.argsort(self("timestamp"), kind="stable") if self._data else None
-
-    def __bool__(self) -> bool:
-        return bool(self._data) and len(self._data["timestamp"]) > 0
-
-    def __contains__(self, field_name: str) -> bool:
-        return field_name in self._data
-
-    def __call__(self, *names: str, default: float | None = None) -> np.ndarray:
-        """The first of these fields that the topic has, shape (n,)."""
-        for field_name in names:
-            if field_name in self._data:
-                values = np.asarray(self._data[field_name], dtype=float)
-                order = getattr(self, "_order", None)
-                return values if order is None else values[order]
-        if default is None or "timestamp" not in self._data:
-            raise _MissingFieldError(f"topic {self.name}: expected a field {' or '.join(names)}")
-        return np.full(len(self._data["timestamp"]), default)
-
-    def vector(self, name: str, size: int, default: float | None = None) -> np.ndarray:
-        """An array field, shape (n, size)."""
-        return np.column_stack([self(f"{name}[{i}]", default=default) for i in range(size)])
 
 
 def _ulog_parameters(ulog: Any, notes: list[str]) -> Parameters:
@@ -466,9 +418,9 @@ def _ulog_samples(
         rows[:, : filled.shape[1]] = filled
         blocks.append((kind, topic, arrival, rows))
 
-    imu = _Fields(topics, "sensor_combined")
+    imu = Fields(topics, "sensor_combined")
     if not imu:
-        raise _MissingFieldError("expected the topic sensor_combined, the IMU, found none")
+        raise MissingFieldError("expected the topic sensor_combined, the IMU, found none")
     time = imu("timestamp")
     gyro_dt = imu("gyro_integral_dt") * 1e-6
     accel_dt = imu("accelerometer_integral_dt") * 1e-6
@@ -478,30 +430,30 @@ def _ulog_samples(
     push = imu.vector("accelerometer_m_s2", 3) * accel_dt[:, None]
     add(logs.IMU, imu.name, time, [time, turn, push, gyro_dt, accel_dt, *clipping])
 
-    gnss = _Fields(topics, "vehicle_gps_position", "sensor_gps")
+    gnss = Fields(topics, "vehicle_gps_position", "sensor_gps")
     by_arrival = False
     if gnss:
         by_arrival = _add_gnss(gnss, parameters, add)
-    barometer = _Fields(topics, "vehicle_air_data")
+    barometer = Fields(topics, "vehicle_air_data")
     if barometer:
-        altitude = [_stamp(barometer), barometer("baro_alt_meter")]
+        altitude = [sample_times(barometer), barometer("baro_alt_meter")]
         add(logs.BAROMETER, barometer.name, barometer("timestamp"), altitude)
-    magnetometer = _Fields(topics, "vehicle_magnetometer")
+    magnetometer = Fields(topics, "vehicle_magnetometer")
     if magnetometer:
-        strength = [_stamp(magnetometer), magnetometer.vector("magnetometer_ga", 3)]
+        strength = [sample_times(magnetometer), magnetometer.vector("magnetometer_ga", 3)]
         add(logs.MAGNETOMETER, magnetometer.name, magnetometer("timestamp"), strength)
-    ranging = _Fields(topics, "distance_sensor")
+    ranging = Fields(topics, "distance_sensor")
     if ranging:
         down = ranging("orientation", default=_DOWNWARD) == _DOWNWARD
         columns = [ranging("timestamp"), ranging("current_distance")]
         columns.append(ranging("signal_quality", default=-1.0))
         add(logs.RANGE_FINDER, ranging.name, columns[0][down], [c[down] for c in columns])
-    vision = _Fields(topics, "vehicle_visual_odometry")
+    vision = Fields(topics, "vehicle_visual_odometry")
     if vision:
         _add_vision(vision, add)
     else:
         _add_fused_vision(topics, parameters, add, notes)
-    landed = _Fields(topics, "vehicle_land_detected")
+    landed = Fields(topics, "vehicle_land_detected")
     if landed:
         # what was true when the log began is known from its first sample on
         status_time = np.maximum(landed("timestamp"), time[0])
@@ -530,13 +482,7 @@ def _merged(
     return SensorLog(kinds[order], arrivals[order], rows, by_arrival), [where[i] for i in order]
 
 
-def _stamp(topic: _Fields) -> np.ndarray:
-    """When a sample was measured (us), its publication where the driver did not say."""
-    published, sampled = topic("timestamp"), topic("timestamp_sample", default=0.0)
-    return np.where(sampled > 0.0, sampled, published)
-
-
-def _add_gnss(gnss: _Fields, parameters: Parameters, add: Any) -> bool:
+def _add_gnss(gnss: Fields, parameters: Parameters, add: Any) -> bool:
     """Add GNSS samples; whether they are stamped with their arrival."""
     published = gnss("timestamp")
     by_arrival = (
@@ -548,7 +494,7 @@ def _add_gnss(gnss: _Fields, parameters: Parameters, add: Any) -> bool:
         place = [gnss("lat") * 1e-7, gnss("lon") * 1e-7, gnss("alt") * 1e-3]
     dilution = np.hypot(gnss("hdop", default=0.0), gnss("vdop", default=0.0))
     columns = [
-        published if by_arrival else _stamp(gnss),
+        published if by_arrival else sample_times(gnss),
         *place,
         *(gnss(f"vel_{axis}_m_s") for axis in "ned"),
         *(gnss(name) for name in ("eph", "epv", "s_variance_m_s", "fix_type", "satellites_used")),
@@ -561,7 +507,7 @@ def _add_gnss(gnss: _Fields, parameters: Parameters, add: Any) -> bool:
     return by_arrival
 
 
-def _add_vision(vision: _Fields, add: Any) -> None:
+def _add_vision(vision: Fields, add: Any) -> None:
     """Add odometry; before 2022 it had other names (x, y, z, covariances)."""
     published = vision("timestamp")
     if "position[0]" in vision:
@@ -587,7 +533,7 @@ def _add_vision(vision: _Fields, add: Any) -> None:
             codes[frame == code] = own
         translated.append(codes)
     columns = [
-        _stamp(vision), position, velocity, vision.vector("q", 4), *variances, *translated,
+        sample_times(vision), position, velocity, vision.vector("q", 4), *variances, *translated,
         vision("reset_counter", default=0.0), np.clip(vision("quality", default=100.0), 0.0, 100.0),
     ]  # fmt: skip
     add(logs.EXTERNAL_VISION, vision.name, published, columns)
@@ -600,7 +546,7 @@ def _add_fused_vision(
 
     They were logged slower than the filter needs them, so they are interpolated.
     """
-    position = _Fields(topics, "estimator_aid_src_ev_pos")
+    position = Fields(topics, "estimator_aid_src_ev_pos")
     if not position:
         return
     delay = 1e3 * parameters.get("EKF2_EV_DELAY", 0.0)
@@ -610,7 +556,7 @@ def _add_fused_vision(
         return
     grid = np.arange(used[0], used[-1], _VISION_PERIOD_US)
 
-    def interpolated(topic: _Fields, values: np.ndarray) -> np.ndarray:
+    def interpolated(topic: Fields, values: np.ndarray) -> np.ndarray:
         stamps, own = np.unique(topic("timestamp_sample"), return_index=True)
         return np.interp(grid, stamps, values[own])
 
@@ -621,12 +567,12 @@ def _add_fused_vision(
         for i in (0, 1)
     )
     down = variance_d = yaw = variance_yaw = absent
-    height = _Fields(topics, "estimator_aid_src_ev_hgt")
+    height = Fields(topics, "estimator_aid_src_ev_hgt")
     if height:
         down, variance_d = (
             interpolated(height, height(name)) for name in ("observation", "observation_variance")
         )
-    heading = _Fields(topics, "estimator_aid_src_ev_yaw")
+    heading = Fields(topics, "estimator_aid_src_ev_yaw")
     if heading:
         yaw = interpolated(heading, np.unwrap(heading("observation")))
         variance_yaw = interpolated(heading, heading("observation_variance"))
@@ -647,23 +593,8 @@ def _add_fused_vision(
     )
 
 
-def _on_board(topics: Mapping[str, Topic]) -> OnBoard | None:
-    attitude = _Fields(topics, "vehicle_attitude", "estimator_attitude")
-    motion = _Fields(topics, "vehicle_local_position", "estimator_local_position")
-    if not attitude or not motion:
-        return None
-    q = np.column_stack([_stamp(attitude), attitude.vector("q", 4)])
-    names = ("vx", "vy", "vz", "x", "y", "z")
-    moved = np.column_stack([_stamp(motion), *(motion(name) for name in names)])
-    reference = np.column_stack(
-        [motion(name, default=math.nan) for name in ("ref_lat", "ref_lon", "ref_alt")]
-    )
-    sane = np.isfinite(moved).all(axis=1)
-    return OnBoard(q[np.isfinite(q).all(axis=1)], moved[sane], reference[sane])
-
-
 def _range_limits(topics: Mapping[str, Topic]) -> tuple[float, float]:
-    ranging = _Fields(topics, "distance_sensor")
+    ranging = Fields(topics, "distance_sensor")
     if not ranging:
         return FlightLog.range_limits
     shortest = float(np.median(ranging("min_distance", default=0.1)))

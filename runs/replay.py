@@ -6,7 +6,7 @@ same with Drake's systems; both end in the same bits.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from systems.estimators.ekf2.fusion import covariance
 from systems.estimators.ekf2.geometry import project
 from systems.estimators.ekf2.output_predictor import output_position
 from systems.estimators.ekf2.parameters import Defaults, ParameterError, Value
+from systems.estimators.ekf2.warm_start import Start, with_start
 from systems.estimators.ekf2.world_model import earth_field
 from systems.signals import sensor_log as logs
 from systems.signals.sensor_log import SensorLog
@@ -107,7 +108,7 @@ def record_delayed(x, arrival, row):
     row[STATUS_COLUMN + 2] = x[at.HEIGHT_REFERENCE]
     to = _FIRST_BIAS
     for bias in (at.BIAS_BARO, at.BIAS_GNSS_HGT, at.BIAS_EV_HGT, at.BIAS_EV_NORTH, at.BIAS_EV_EAST):
-        row[to] = x[bias + at.B_BIAS]
+        row[to] = x[bias + at.B_REPORTED]
         to += 1
     for counter in (
         at.R_POSITION_NE,
@@ -169,8 +170,7 @@ def record_aid(x, arrival, latest, rows):
 
 
 @_kernel
-def _play(x, p, kinds, arrivals, samples, gnss_delay, delayed, output, aid, counts):
-    latest = np.zeros(_SOURCES)
+def _play(x, p, kinds, arrivals, samples, gnss_delay, latest, delayed, output, aid, counts):
     steps = moves = observations = i = 0
     while i < kinds.size:
         arrival = arrivals[i]
@@ -289,7 +289,13 @@ def gnss_delay(samples: SensorLog, p: np.ndarray) -> float:
     return 1e3 * float(p[prm.EKF2_GPS_DELAY]) if samples.gnss_by_arrival else 0.0
 
 
-def play(samples: SensorLog, p: np.ndarray) -> Replay:
+def initial_state(p: np.ndarray, start: Start | None = None) -> np.ndarray:
+    """The filter's array before the first sample, empty or to be started from a state."""
+    x = kernels.initialise(p)
+    return x if start is None else with_start(x, start)
+
+
+def play(samples: SensorLog, p: np.ndarray, start: Start | None = None) -> Replay:
     """Run the filter over a log.
 
     Parameters
@@ -298,16 +304,45 @@ def play(samples: SensorLog, p: np.ndarray) -> Replay:
         All samples.
     p : np.ndarray
         From `parameter_array`.
+    start : Start, optional
+        The state to start from, e.g. that of the filter on board; by default it starts anew.
     """
-    x = kernels.initialise(p)
-    moves = int(np.count_nonzero(samples.kinds == logs.IMU))
-    delayed = np.empty((moves, len(DELAYED_COLUMNS)))
-    output = np.empty((moves, len(OUTPUT_COLUMNS)))
-    aid = np.empty((moves * _ROWS_A_STEP, len(AID_COLUMNS)))
-    counts = np.zeros(3, dtype=np.int64)
-    _play(
-        x, p, samples.kinds, samples.arrivals, samples.rows, gnss_delay(samples, p),
-        delayed, output, aid, counts,
-    )  # fmt: skip
-    steps, moves, observations = counts.tolist()
-    return Replay(delayed[:steps].copy(), output[:moves].copy(), aid[:observations].copy(), x)
+    (replay,) = play_in_pieces(samples, p, [], start)
+    return replay
+
+
+def play_in_pieces(
+    samples: SensorLog, p: np.ndarray, times: Sequence[float], start: Start | None = None
+) -> Iterator[Replay]:
+    """Run the filter over a log and stop in between, to look at all of its state.
+
+    Parameters
+    ----------
+    samples, p, start
+        As for `play`.
+    times : sequence of float
+        us, in order; a piece ends before the first arrival after each, the last one at the
+        log's end.
+
+    Yields
+    ------
+    Replay
+        Of one piece; its `state` is the filter's own array, which the next piece goes on with.
+    """
+    x = initial_state(p, start)
+    latest = np.zeros(_SOURCES)
+    delay = gnss_delay(samples, p)
+    ends = [*np.searchsorted(samples.arrivals, times, side="right"), len(samples.arrivals)]
+    for first, last in zip([0, *ends], ends, strict=False):
+        kinds = samples.kinds[first:last]
+        moves = int(np.count_nonzero(kinds == logs.IMU))
+        delayed = np.empty((moves, len(DELAYED_COLUMNS)))
+        output = np.empty((moves, len(OUTPUT_COLUMNS)))
+        aid = np.empty((moves * _ROWS_A_STEP, len(AID_COLUMNS)))
+        counts = np.zeros(3, dtype=np.int64)
+        _play(
+            x, p, kinds, samples.arrivals[first:last], samples.rows[first:last], delay, latest,
+            delayed, output, aid, counts,
+        )  # fmt: skip
+        steps, moves, observations = counts.tolist()
+        yield Replay(delayed[:steps].copy(), output[:moves].copy(), aid[:observations].copy(), x)

@@ -61,13 +61,15 @@ def source_rows(replay: Replay, name: str) -> np.ndarray:
 
 
 def summaries(replay: Replay) -> list[SourceSummary]:
-    """All sources that made observations."""
+    """All sources that made observations; those without a sensor only where they were used."""
     result = []
     for name in at.AID_NAMES:
         rows = source_rows(replay, name)
         if not len(rows):
             continue
         fused = rows[:, 0, 12] > 0.5
+        if name not in GATES and not fused.any():
+            continue  # gravity, computed and not used beside GNSS
         with np.errstate(all="ignore"):
             squares = rows[fused][:, :, 7] ** 2 / rows[fused][:, :, 8]
             ratios = np.nanmax(np.nan_to_num(rows[:, :, 9]), axis=1)
@@ -98,6 +100,12 @@ def diagnosis(log: FlightLog, replay: Replay, p: np.ndarray) -> list[str]:
             "shows 0.8 to 1.2 g and the gyro less than 15 deg/s."
         ]
     sentences: list[str] = []
+    if log.start is not None:
+        sentences.append(
+            "The filter starts from the state that the one on board had "
+            f"{1e-6 * (log.start.time - replay.output[0, 0]):.2f} s into the log; "
+            "--start cold starts it anew."
+        )
     step = 1e3 * float(replay.column("dt_ekf_avg")[-1])
     for kind in _SENSORS:
         sentences += _latency(log, replay, p, kind, horizon(replay), step)

@@ -24,6 +24,17 @@ _POINTS = 3000  # of a line, about as many as a screen has pixels
 _AXIS_COLOURS = (BLUE, ORANGE, GREEN)
 
 
+def _finished(plot: figure) -> figure:
+    """With its legend above, where it hides nothing and all time axes stay aligned."""
+    plot = _finish(plot)
+    if plot.legend:
+        legend = plot.legend[0]
+        plot.center.remove(legend)
+        legend.orientation, legend.margin, legend.padding, legend.spacing = "horizontal", 0, 0, 12
+        plot.add_layout(legend, "above")
+    return plot
+
+
 class ReplayPlots:
     """The plots of a replay, time axes linked.
 
@@ -81,7 +92,7 @@ class ReplayPlots:
                     plot, self._seconds(stamps), angle, color=colour, line_dash=dash,
                     line_width=1.4, legend_label=label,
                 )  # fmt: skip
-        return _finish(plot)
+        return _finished(plot)
 
     def motion(self) -> list[figure]:
         """Velocity and position, replayed and on board."""
@@ -105,7 +116,7 @@ class ReplayPlots:
                         plot, self._seconds(theirs[:, 0]), theirs[:, first + axis], color=colour,
                         line_dash="dotted", line_width=1.4, legend_label=f"{name} on board",
                     )  # fmt: skip
-            plots.append(_finish(plot))
+            plots.append(_finished(plot))
         return plots
 
     def _inside(self, rows: np.ndarray) -> np.ndarray:
@@ -172,7 +183,7 @@ class ReplayPlots:
         limit = float(np.median(settled)) * 1.5 * max(gate, 3.0)
         if np.isfinite(limit) and limit > 0.0:
             plot.y_range = Range1d(-limit, limit)
-        return _finish(plot)
+        return _finished(plot)
 
     def test_ratios(self) -> figure:
         """Test ratios of all sources; above one an observation is rejected."""
@@ -187,7 +198,7 @@ class ReplayPlots:
                     color=colours[index % len(colours)], line_width=1, legend_label=name,
                 )  # fmt: skip
         plot.add_layout(Span(location=1.0, dimension="width", line_color=RED, line_dash="dashed"))
-        return _finish(plot)
+        return _finished(plot)
 
     def sweep(self, sweep: Sweep) -> figure:
         """The score over the swept parameter."""
@@ -198,7 +209,7 @@ class ReplayPlots:
         inside = [point for point in points if point.inside]
         plot.scatter([p.value for p in inside], [p.score for p in inside], size=8, color=GREEN,
                      legend_label="not distinguishable from the best")  # fmt: skip
-        return _finish(plot)
+        return _finished(plot)
 
 
 def _euler(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

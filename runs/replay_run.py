@@ -1,7 +1,9 @@
 """A replay with its folder: read, run, then write tables, `log.ulg` and `report.html`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from rich.progress import Progress
 
@@ -13,6 +15,8 @@ from runs.replay_sweep import Sweep, parse_sweep, sweep, sweep_table
 from runs.replay_tables import write_replay_ulog, write_tables
 from systems.estimators.ekf2.parameters import Defaults, Value
 
+Start = Literal["warm", "cold"]
+
 
 def replay_and_report(
     path: Path,
@@ -22,6 +26,7 @@ def replay_and_report(
     defaults: Defaults = "module",
     sweep_text: str | None = None,
     report: bool = True,
+    start: Start = "warm",
 ) -> list[str]:
     """Replay a log and write its folder.
 
@@ -41,6 +46,9 @@ def replay_and_report(
         NAME=FIRST:LAST:STEP; the replay then uses the best value.
     report : bool
         Write `report.html`.
+    start : str
+        "warm": from the state that the filter on board had when the log began, if it is logged;
+        "cold": anew.
 
     Returns
     -------
@@ -54,7 +62,7 @@ def replay_and_report(
     """
     changed = dict(_override(text) for text in overrides)
     swept = parse_sweep(sweep_text) if sweep_text is not None else None
-    log = read_log(path)
+    log = read_log(path) if start == "warm" else replace(read_log(path), start=None)
     values = parameter_values(log, parameter_file, changed)
     found: Sweep | None = None
     if swept is not None:
@@ -65,7 +73,7 @@ def replay_and_report(
         (folder / "sweep.csv").write_text(sweep_table(found), encoding="utf-8")
         values[name] = found.best.value
     p = parameter_array(log, values, defaults)
-    replay = play(log.samples, p)
+    replay = play(log.samples, p, log.start)
     write_tables(folder, replay)
     write_replay_ulog(folder / "log.ulg", replay, values)
     if report:

@@ -188,7 +188,8 @@ class _Score:
 def _score(
     log: FlightLog, values: dict[str, Value], defaults: Defaults, parameter: str, value: float
 ) -> _Score:
-    replay = play(log.samples, parameter_array(log, {**values, parameter: value}, defaults))
+    p = parameter_array(log, {**values, parameter: value}, defaults)
+    replay = play(log.samples, p, log.start)
     own = next((names for prefix, names in _SOURCES.items() if parameter.startswith(prefix)), _ALL)
     aid = np.concatenate(
         [source_rows(replay, name).reshape(-1, replay.aid.shape[1]) for name in own]

@@ -5,6 +5,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jinja2
@@ -15,11 +16,8 @@ from bokeh.resources import INLINE
 from pydrake.systems.framework import Context
 
 from diagrams.graph import svg_of, wiring_dot
-from diagrams.landing import LandingDiagram
 from diagrams.loading import to_yaml
-from runs.plots import RunPlots
-from runs.replay_3d import replay_html
-from runs.run import RunResult
+from runs.presentation import PRESENTATIONS
 
 FRAME_QUALITY = 82  # JPEG
 
@@ -37,14 +35,14 @@ class CameraStrip:
 
     Parameters
     ----------
-    landing : LandingDiagram
+    landing : LandingDiagram or LandingWithoutGpsDiagram
         Its cameras' `image` ports render the exposure that lies in the Context, at
         either fidelity.
     period : float
         s of simulated time between two pictures of one camera.
     """
 
-    def __init__(self, landing: LandingDiagram, period: float = 2.0):
+    def __init__(self, landing: Any, period: float = 2.0):
         self.landing = landing
         self.period = period
         self.frames: list[Frame] = []
@@ -62,8 +60,8 @@ class CameraStrip:
 
 def write_report(
     path: Path,
-    landing: LandingDiagram,
-    result: RunResult,
+    landing: Any,
+    result: Any,
     log: pa.Table,
     frames: Sequence[Frame] = (),
 ) -> None:
@@ -73,28 +71,34 @@ def write_report(
     ----------
     path : Path
         Of the page.
-    landing : LandingDiagram
+    landing : LandingDiagram or LandingWithoutGpsDiagram
         The diagram that flew.
-    result : RunResult
+    result : RunResult or RunwayResult
         Its verdict.
     log : pa.Table
         Its log.
     frames : sequence of Frame
         From a `CameraStrip`; none leaves the section out.
     """
-    plots = RunPlots(log, landing.state_names())
-    script, division = components(plots.layout())
     scenario = result.scenario
+    shown = PRESENTATIONS[scenario.kind]
+    layouts = shown.layouts(log, landing.state_names(), scenario)
+    script, divisions = components(layouts)
     sections = [
         ("replay", "Replay"),
         ("plots", "Flight"),
+        ("svgs", "Beacons"),
         ("cameras", "Cameras"),
         ("states", "States"),
         ("wiring", "Wiring"),
         ("scenario", "Scenario"),
     ]
-    if not frames:
-        sections = [section for section in sections if section[0] != "cameras"]
+    absent = {"cameras"} if not frames else set()
+    if "svgs" not in layouts:
+        absent.add("svgs")
+    if shown.replay is None:
+        absent.add("replay")
+    sections = [section for section in sections if section[0] not in absent]
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("runs", "."), autoescape=True
     ).get_template("report.html.jinja")
@@ -104,42 +108,21 @@ def write_report(
         landed=result.landed,
         verdict=result.reason.capitalize(),
         sections=sections,
-        figures=_figures(result),
-        replay=replay_html(scenario, log),
+        figures=result.figures(),
+        replay=shown.replay(scenario, log) if shown.replay else "",
+        plots_note=shown.plots_note,
         plot_resources=jinja2.utils.markupsafe.Markup(INLINE.render()),
-        plots=jinja2.utils.markupsafe.Markup(division),
+        plots=jinja2.utils.markupsafe.Markup(divisions["plots"]),
+        svgs=jinja2.utils.markupsafe.Markup(divisions.get("svgs", "")),
         plot_script=jinja2.utils.markupsafe.Markup(script),
         frames=frames,
-        frames_note=_frames_note(scenario.fidelity),
+        frames_note=shown.frames_note(scenario),
         states=_drawing(landing.states_dot()),
         wiring=_drawing(wiring_dot(landing.diagram, max_depth=1)),
         scenario=to_yaml(scenario),
         versions=", ".join(f"{name} {version}" for name, version in result.versions.items()),
     )
     path.write_text(page, encoding="utf-8")
-
-
-def _figures(result: RunResult) -> list[tuple[str, str]]:
-    x, y = (100.0 * value for value in result.landing_offset_m)
-    speed = result.simulated_s / result.cpu_s if result.cpu_s > 0.0 else float("nan")
-    return [
-        (f"{100.0 * result.landing_error_m:.1f} cm", "landing error"),
-        (f"{x:+.0f}, {y:+.0f} cm", "east, north"),
-        (f"{result.touchdown_speed_m_s:.2f} m/s", "touchdown speed"),
-        (f"{result.landing_time_s:.1f} s", "landing time"),
-        (f"{result.attempts}", "attempt" if result.attempts == 1 else "attempts"),
-        (f"{result.simulated_s:.0f} s", "flight"),
-        (f"{speed:.0f} ×", "simulated seconds per CPU second"),
-    ]
-
-
-def _frames_note(fidelity: str) -> str:
-    if fidelity == "pixels":
-        return "The very images that the detectors worked on, with their detections drawn in."
-    return (
-        "This run flew on geometric cameras; the images are what the same exposures look like, "
-        "with the measurements drawn in."
-    )
 
 
 def _drawing(dot: str) -> jinja2.utils.markupsafe.Markup:

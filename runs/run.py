@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
-from typing import Any
+from pkgutil import resolve_name
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -59,6 +60,32 @@ class RunResult:
             "configuration": to_plain(self.scenario),
         }
 
+    def sentences(self) -> list[str]:
+        """The result in words, for the command line."""
+        verdict = f"{'Landed' if self.landed else 'Not landed'}: {self.reason}"
+        if not self.landed:
+            return [verdict, f"After {self.simulated_s:.1f} s and {self.attempts} attempts"]
+        return [
+            verdict,
+            f"Landing error {100 * self.landing_error_m:.1f} cm, "
+            f"landing time {self.landing_time_s:.1f} s, "
+            f"touchdown at {self.touchdown_speed_m_s:.2f} m/s",
+        ]
+
+    def figures(self) -> list[tuple[str, str]]:
+        """The numbers at the head of the report: value and name."""
+        x, y = (100.0 * value for value in self.landing_offset_m)
+        speed = self.simulated_s / self.cpu_s if self.cpu_s > 0.0 else float("nan")
+        return [
+            (f"{100.0 * self.landing_error_m:.1f} cm", "landing error"),
+            (f"{x:+.0f}, {y:+.0f} cm", "east, north"),
+            (f"{self.touchdown_speed_m_s:.2f} m/s", "touchdown speed"),
+            (f"{self.landing_time_s:.1f} s", "landing time"),
+            (f"{self.attempts}", "attempt" if self.attempts == 1 else "attempts"),
+            (f"{self.simulated_s:.0f} s", "flight"),
+            (f"{speed:.0f} ×", "simulated seconds per CPU second"),
+        ]
+
 
 class Laboratory:
     """One diagram, flown as often as wanted.
@@ -71,19 +98,26 @@ class Laboratory:
     scenario : MultirotorLanding
         What to build and, until `configure` says otherwise, to fly.
 
+    Attributes
+    ----------
+    builds : type
+        The class of its diagram; a laboratory of another kind of scenario names another.
+
     Raises
     ------
     ScenarioError
         If the scenario's parts do not fit together.
     """
 
-    def __init__(self, scenario: MultirotorLanding):
+    builds: ClassVar[type] = LandingDiagram
+
+    def __init__(self, scenario: Any):
         with _scenario_errors(scenario):
-            self.landing = LandingDiagram(scenario)
+            self.landing = self.builds(scenario)
         self.diagram = self.landing.diagram
         self.scenario = scenario
 
-    def configure(self, scenario: MultirotorLanding) -> None:
+    def configure(self, scenario: Any) -> None:
         """Take over another scenario of the same structure; raises `StructureChangedError`."""
         with _scenario_errors(scenario):
             self.landing.configure(scenario)
@@ -108,10 +142,8 @@ class Laboratory:
         self._contexts = list(_contexts(self.diagram, context))
         return simulator
 
-    def fly(
-        self, simulator: Simulator | None = None, progress: Progress | None = None
-    ) -> RunResult:
-        """Fly to the end of the run.
+    def fly(self, simulator: Simulator | None = None, progress: Progress | None = None) -> Any:
+        """Fly to the end of the run; returns its result.
 
         Parameters
         ----------
@@ -134,7 +166,7 @@ class Laboratory:
                 break  # by the observer, at its time limit at the latest
         return self.result(context, cpu)
 
-    def result(self, context: Context, cpu: float = 0.0) -> RunResult:
+    def result(self, context: Context, cpu: float = 0.0) -> Any:
         """The verdict on the run so far."""
         touchdown = TOUCHDOWN(self.landing.evaluate("touchdown", context))
         status = SUPERVISOR_STATUS(self.landing.evaluate("supervisor", context))
@@ -165,7 +197,7 @@ class Laboratory:
 
 
 @contextmanager
-def _scenario_errors(scenario: MultirotorLanding) -> Iterator[None]:
+def _scenario_errors(scenario: Any) -> Iterator[None]:
     """What a block refuses is an error of the scenario."""
     try:
         yield
@@ -176,29 +208,39 @@ def _scenario_errors(scenario: MultirotorLanding) -> Iterator[None]:
 
 
 def _contexts(system: System, root: Context) -> Iterator[Context]:
-    """The contexts of a system and of everything in it."""
-    yield system.GetMyContextFromRoot(root)
+    """The contexts of everything in a system, but not its own.
+
+    Asked for the root's own context, Drake's bindings make it keep itself alive for ever.
+    """
     if isinstance(system, Diagram):
         for part in system.GetSystems():
+            yield part.GetMyContextFromRoot(root)
             yield from _contexts(part, root)
 
 
+# Who flies a kind of scenario, module:class; imported when first needed.
+LABORATORIES = {
+    "multirotor_landing": "runs.run:Laboratory",
+    "landing_without_gps": "runs.landing_without_gps:RunwayLaboratory",
+}
 _laboratories: list[Laboratory] = []
 _KEPT = 16  # diagrams a process keeps; each costs about a megabyte
 
 
-def laboratory(scenario: MultirotorLanding) -> Laboratory:
+def laboratory(scenario: Any) -> Laboratory:
     """A laboratory for `scenario`, re-used within the process where the structure allows."""
     for lab in _laboratories:
+        if type(lab.scenario) is not type(scenario):
+            continue
         try:
             lab.configure(scenario)
         except StructureChangedError:
             continue
         return lab
-    lab = Laboratory(scenario)
-    _laboratories.append(lab)
+    new: Laboratory = resolve_name(LABORATORIES[scenario.kind])(scenario)
+    _laboratories.append(new)
     del _laboratories[:-_KEPT]
-    return lab
+    return new
 
 
 def versions() -> dict[str, str]:

@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from systems.configuration import Positive, configuration, require_same_structure
-from systems.schedule import CLOCK_PERIOD, ESTIMATE_OFFSET
+from systems.schedule import CLOCK_PERIOD
 from systems.signals.measurement import Layout
 
 _EARLY = 1e-6  # s, by which a look at the clock may be early
@@ -62,7 +62,7 @@ class DataRecorder(LeafSystem):
     | event | when | does |
     |---|---|---|
     | begin | at initialisation | an empty file with the first line |
-    | update | every CLOCK_PERIOD from ESTIMATE_OFFSET | a row, if 1 / rate has passed |
+    | update | every CLOCK_PERIOD from 0 | a row, if 1 / rate has passed |
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class DataRecorder(LeafSystem):
             self._sizes.append(len(fields))
         self.DeclareDiscreteState(1)  # s, when the next row is due
         self.DeclareInitializationPublishEvent(self._begin)
-        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
 
     def configure(self, config: DataRecorderConfig, seed: int = 0) -> None:
         """Take over another configuration; the rate must stay."""

@@ -1,27 +1,24 @@
-"""When things happen: one base period times powers of two, and two phases a tick.
+"""When things happen: one base period times powers of two, every block on the same tick.
 
-Other periods make Drake take extra steps one ulp long, and simultaneous events
-all see the values from before the tick. So every block runs in one of two phases
-of an 8 ms tick:
+Other periods make Drake take extra steps one ulp long, and every step costs Drake about
+25 us whatever happens in it. So there is one tick, of 10 ms, and all blocks have their
+events on it or on a multiple of it.
 
-| phase | offset | who, in order of cause |
-|---|---|---|
-| sense and decide | 0 ms | plant, sensors, faults, supervisors, observers |
-| estimate and act | 4 ms | delay lines, estimators, controllers |
+All discrete updates of one instant see the values from before it: every hop from block to
+block takes a tick. A gyro sample of time t is used by the controller at t + 10 ms and
+moves the rotors from t + 20 ms on. An autopilot's rate loop is three times as fast; the
+gains of ours are chosen for its own delay (`MultirotorCascadeConfig.gains`), and what is
+studied here, landings on late and wrong measurements, happens in tenths of seconds.
 
-A gyro sample taken at t is used by the controller at t + 4 ms and moves the
-rotors from t + 8 ms. Blocks of one phase see each other one period late.
-
-Why 8 ms: PX4's EKF2 makes a step every 8 to 10 ms, rotors of this size answer in
-25 to 60 ms, and an event costs Drake's Python systems about 8 us whatever it does.
-The plant integrates with shorter steps of its own inside the tick.
+Why 10 ms: PX4's EKF2 makes its step every 10 ms (EKF2_PREDICT_US), rotors of this size
+answer in 25 to 60 ms, and an event costs Drake's Python systems about 12 us whatever it
+does. The plant integrates with shorter steps of its own inside the tick.
 """
 
-BASE_PERIOD = 0.002  # s
-PLANT_PERIOD = 0.008  # s, plant, IMU, EKF2 and controller
-ESTIMATE_OFFSET = 0.004  # s, the phase of estimators and controllers
-CLOCK_PERIOD = 0.016  # s, grid on which sensors with odd rates look at their clock
-SUPERVISOR_PERIOD = 0.032  # s
+BASE_PERIOD = 0.0025  # s
+PLANT_PERIOD = 0.01  # s, plant, IMU, EKF2 and controller
+CLOCK_PERIOD = 0.02  # s, grid on which sensors with odd rates look at their clock
+SUPERVISOR_PERIOD = 0.04  # s
 
 
 def on_grid(period: float) -> float:

@@ -143,6 +143,11 @@ class FixedWingFlightController(LeafSystem):
         self._gains = config.gains.vector()
         self._deceleration = config.gains.deceleration
 
+    @property
+    def model(self) -> tuple:
+        """Waypoints, heading, profile, gains and deceleration, as `control` takes them."""
+        return self._waypoints, self._heading, self._profile, self._gains, self._deceleration
+
     def _control(self, context, discrete_state):
         estimate = self._estimate.Eval(context)
         if estimate[1] == 0.0:

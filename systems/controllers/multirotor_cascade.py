@@ -24,7 +24,7 @@ from systems.configuration import (
 )
 from systems.controllers import multirotor_cascade_kernel as kernel
 from systems.controllers.multirotor_cascade_kernel import CASCADE_SETPOINTS, PARAMETERS, STATE
-from systems.schedule import ESTIMATE_OFFSET, PLANT_PERIOD
+from systems.schedule import PLANT_PERIOD
 from systems.signals.measurement import INERTIAL, SETPOINT, VEHICLE_ESTIMATE, no_measurement
 from systems.signals.optional_input import optional_input
 
@@ -154,20 +154,20 @@ class MultirotorCascadeConfig:
         which damps it with √½.
 
         * Roll and pitch rate: MC_*RATE_D / MC_*RATE_P is the rotors' lag τ and cancels
-          it. What is left are the low passes of gyro and D term and two periods
-          for sampling, transport and holding: T = √2/(2π·IMU_GYRO_CUTOFF) +
-          1/(2π·IMU_DGYRO_CUTOFF) + 2·8 ms. So P·K = 1/(2T) = 19 rad/s.
+          it. What is left are the low passes of gyro and D term and three periods, two for
+          transport and one for sampling and holding: T = √2/(2π·IMU_GYRO_CUTOFF) +
+          1/(2π·IMU_DGYRO_CUTOFF) + 3·10 ms. So P·K = 1/(2T) = 12 rad/s.
         * Roll and pitch: min(6.5, 1/(2 (τ + 2T))), for a rate that is reached in τ + 2T.
         * Yaw rate, without D: min(1/(2 (T + τ)), 2·MC_YAW_P), no faster than the yaw
           loop needs, because drag torque is scarce; T without the D term's filter.
         * MC_*RATE_I / MC_*RATE_P stays PX4's.
 
-        With the Iris' lag of 19 ms this gives D/P = 0.019 s and 6.5 1/s, PX4's
-        0.020 s and 6.5 1/s for that vehicle.
+        With the Iris' lag of 19 ms this gives D/P = 0.019 s (PX4: 0.020 s) and 5.0 1/s;
+        PX4, with periods of 1 to 4 ms, affords 6.5 1/s.
         """
         vehicle = self.resolved_vehicle()
         lag = 0.5 * (vehicle.time_constant_up + vehicle.time_constant_down)
-        sampling = math.sqrt(2.0) / (2.0 * math.pi * self.IMU_GYRO_CUTOFF) + 2.0 * PLANT_PERIOD
+        sampling = math.sqrt(2.0) / (2.0 * math.pi * self.IMU_GYRO_CUTOFF) + 3.0 * PLANT_PERIOD
         filters = sampling + 1.0 / (2.0 * math.pi * self.IMU_DGYRO_CUTOFF)
         p = np.array([self.MC_ROLLRATE_P, self.MC_PITCHRATE_P, self.MC_YAWRATE_P])
         i = np.array([self.MC_ROLLRATE_I, self.MC_PITCHRATE_I, self.MC_YAWRATE_I])
@@ -337,7 +337,8 @@ class MultirotorCascade(LeafSystem):
 
     Setpoint. A finite p is flown to, with v as feed-forward (0 if NaN); where p is NaN,
     v is tracked; where both are NaN, or the estimate is not valid, the axis asks for no
-    acceleration. A NaN yaw holds the heading. armed = 0 stops the rotors at once.
+    acceleration. A finite a is added to the acceleration that is asked for, as in PX4's
+    trajectory_setpoint. A NaN yaw holds the heading. armed = 0 stops the rotors at once.
 
     Trajectory, all in state: a target speed v* = v + min(√-law(p − p_ref),
     maximum_speed), followed by v_ref with at most MPC_ACC_* and MPC_JERK_AUTO and
@@ -347,7 +348,7 @@ class MultirotorCascade(LeafSystem):
     turns within MPC_YAWRAUTO_MAX and MPC_YAWRAUTO_ACC.
 
         position    v_sp = v_ref + P (p_ref − p)
-        velocity    a_sp = a_ref + P (v_sp − v) + ∫ I (v_sp − v) − D v̇
+        velocity    a_sp = a + a_ref + P (v_sp − v) + ∫ I (v_sp − v) − D v̇
         thrust      along (a_sp,x, a_sp,y, g), tilted by at most MPC_TILTMAX_AIR; its
                     vertical part is hover·(1 + a_sp,z/g); vertical goes before horizontal
                     but for MPC_THR_XY_MARG
@@ -361,7 +362,7 @@ class MultirotorCascade(LeafSystem):
     The horizontal velocity integral is unwound by back-calculation, the others are
     clamped at saturation. Gains of the inner loops: `MultirotorCascadeConfig.gains`.
 
-    Body rate. The gyro's sample is 8 ms younger than the estimate that is made from it
+    Body rate. The gyro's sample is 10 ms younger than the estimate that is made from it
     in the same phase, so w is delta_angle/dt minus a bias: the last gyro sample minus
     the estimate's rate that came of it, low-passed with `gyro_bias_time`. Without a
     valid sample w is the estimate's rate. P and I see w behind IMU_GYRO_CUTOFF (second
@@ -381,10 +382,10 @@ class MultirotorCascade(LeafSystem):
     | event | when | what |
     |---|---|---|
     | initialize | at the start | the initial state of the last `configure` |
-    | update | every 8 ms from 4 ms | one pass through all stages |
+    | update | every 10 ms from 0 | one pass through all stages |
 
-    At t the estimate is of t − 12 ms and the gyro's sample the mean from t − 12 ms to
-    t − 4 ms; the plant takes the commands at t + 4 ms and holds them for 8 ms.
+    At t the estimate is of t − 20 ms and the gyro's sample the mean from t − 20 ms to
+    t − 10 ms; the plant takes the commands at t + 10 ms and holds them for 10 ms.
     """
 
     def __init__(self, config: MultirotorCascadeConfig, seed: int = 0):
@@ -402,7 +403,7 @@ class MultirotorCascade(LeafSystem):
             "setpoints", CASCADE_SETPOINTS.size, self._calc_setpoints, {self.xd_ticket()}
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(PLANT_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(PLANT_PERIOD, 0.0, self._update)
 
     def configure(self, config: MultirotorCascadeConfig, seed: int = 0) -> None:
         """Take over another configuration; the number of rotors must stay the same."""

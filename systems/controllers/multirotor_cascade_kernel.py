@@ -128,7 +128,7 @@ _Q, _P, _V, _W = 4, 8, 11, 14
 _HORIZONTAL_RESET_COUNTER, _HORIZONTAL_RESET = 31, 32
 _VERTICAL_RESET_COUNTER, _VERTICAL_RESET = 34, 35
 _IMU_VALID, _DELTA_ANGLE, _DELTA_ANGLE_DT = 3, 4, 10
-_P_SP, _V_SP, _YAW_SP, _ARMED, _MAXIMUM_SPEED = 0, 3, 6, 7, 8
+_P_SP, _V_SP, _YAW_SP, _ARMED, _MAXIMUM_SPEED, _A_SP = 0, 3, 6, 7, 8, 9
 
 _index = PARAMETERS.index
 _DT = _index("period")
@@ -635,6 +635,8 @@ def _position_and_velocity(x, out, estimate, setpoint, k, flying):
                 + x[_VEL_INT + i]
                 - k[_VEL_D_Z if i == 2 else _VEL_D_XY] * x[_V_DOT + i]
             )
+            if flying and math.isfinite(setpoint[_A_SP + i]):
+                out[_OUT_A + i] += setpoint[_A_SP + i]
 
 
 @njit(cache=True)

@@ -21,7 +21,6 @@ from systems.estimators.fused_sensor import (
     build_target_estimator,
     no_target,
 )
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import TARGET_MEASUREMENT, VEHICLE_ESTIMATE
 
 
@@ -33,7 +32,7 @@ class ArduPilotTargetConfig:
     front_end: FusedSensorConfig = Field(default_factory=FusedSensorConfig)
     estimator: Literal["raw_sensor", "kalman"] = "kalman"  # PLND_EST_TYPE 0, 1
     acceleration_noise: Positive = 2.5  # m/s2, PLND_ACC_P_NSE
-    # s, PLND_LAG, length of the inertial buffer; at least one frame of 16 ms
+    # s, PLND_LAG, length of the inertial buffer; at least one frame of 20 ms
     lag: Annotated[float, Field(ge=0.02, le=0.25)] = 0.02
     gate: Positive = 3.0  # on the larger NIS of both axes
     rejections: int = Field(default=3, ge=0)  # in a row; the next measurement is fused anyway
@@ -103,7 +102,7 @@ class ArduPilotTargetFilter(LeafSystem):
     | `target` | `TARGET_ESTIMATE` | the target now; not acquired: the last values |
 
     State r, v of each axis at a delayed horizon, the oldest of n = max(round(lag/T), 1) inertial
-    frames, whatever the measurement's own time; T = 16 ms, Δv = a_WB T:
+    frames, whatever the measurement's own time; T = 20 ms, Δv = a_WB T:
 
         r ← r + v T          P ← F P Fᵀ + diag(0, (acceleration_noise T)²)
         v ← v − Δv(oldest)   F = (1 T; 0 1)
@@ -120,7 +119,7 @@ class ArduPilotTargetFilter(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from 4 ms | predict, take a new measurement, predict to now |
+    | update | every 20 ms from 0 | predict, take a new measurement, predict to now |
     """
 
     def __init__(self, config: ArduPilotTargetConfig, seed: int = 0):
@@ -134,7 +133,7 @@ class ArduPilotTargetFilter(LeafSystem):
         target = self.DeclareDiscreteState(BasicVector(no_target()))
         self.DeclareDiscreteState(BasicVector(memory[:]))
         self.DeclareStateOutputPort("target", target)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
 
     def configure(self, config: ArduPilotTargetConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""

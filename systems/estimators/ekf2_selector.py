@@ -29,10 +29,9 @@ from pydrake.systems.framework import (
 from systems.configuration import NonNegative, Seconds, configuration, require_same_structure
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2.messages import INNOVATIONS, STATUS
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import VEHICLE_ESTIMATE
 
-SCORE_PERIOD = 0.128  # s, between two looks at the test ratios; PX4: with the primary's status
+SCORE_PERIOD = 0.16  # s, between two looks at the test ratios; PX4: with the primary's status
 _SCORE_LIMIT = 1.0
 _SCORE_TO_SWITCH = 0.5
 
@@ -124,7 +123,7 @@ class Ekf2Selector(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 128 ms from ESTIMATE_OFFSET | errors, and the choice |
+    | update | every 160 ms from 0 | errors, and the choice |
     """
 
     def __init__(self, config: Ekf2SelectorConfig, seed: int = 0):
@@ -147,7 +146,7 @@ class Ekf2Selector(LeafSystem):
         self.DeclareVectorOutputPort(
             "instance", BasicVector(2), self._calc_instance, {self.xd_ticket()}
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(SCORE_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(SCORE_PERIOD, 0.0, self._update)
 
     def configure(self, config: Ekf2SelectorConfig, seed: int = 0) -> None:
         """Take over a new configuration; the number of instances must stay."""

@@ -24,7 +24,6 @@ from systems.configuration import (
 )
 from systems.estimators import fused_sensor_kernel as kernel
 from systems.estimators.fused_sensor_kernel import MEMORY, PARAMETERS
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import (
     INFRARED,
     MARKER,
@@ -37,7 +36,7 @@ from systems.signals.measurement import (
 from systems.signals.optional_input import optional_input
 from systems.vision.pinhole import camera_mount
 
-POLL_PERIOD = 0.016  # s, of the front end and of the filters behind it
+POLL_PERIOD = 0.02  # s, of the front end and of the filters behind it
 
 _SOURCES = {
     "infrared": kernel.INFRARED_SOURCE,
@@ -113,7 +112,7 @@ or old: the estimate's height above ground, and without one infrared alone gives
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from 4 ms | one poll |
+    | update | every 20 ms from 0 | one poll |
     """
 
     def __init__(self, config: FusedSensorConfig, seed: int = 0):
@@ -135,7 +134,7 @@ or old: the estimate's height above ground, and without one infrared alone gives
         output = self.DeclareDiscreteState(BasicVector(no_measurement(TARGET_MEASUREMENT)))
         self.DeclareDiscreteState(BasicVector(memory[:]))
         self.DeclareStateOutputPort("measurement", output)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
 
     def configure(self, config: FusedSensorConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""

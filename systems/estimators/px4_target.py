@@ -28,7 +28,6 @@ from systems.estimators.px4_target_kernel import (
     VISION_MEMORY,
     VISION_PARAMETERS,
 )
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import TARGET_MEASUREMENT, VEHICLE_ESTIMATE
 
 
@@ -105,7 +104,7 @@ class PX4TargetFilter(LeafSystem):
     | `estimate` | `VEHICLE_ESTIMATE` | acceleration and velocity |
     | `target` | `TARGET_ESTIMATE` | the target now; not acquired: the last values |
 
-    State r, v of each axis, with a = −a_WB and T = 16 ms:
+    State r, v of each axis, with a = −a_WB and T = 20 ms:
 
         r ← r + v T + ½ a T²    P ← F P Fᵀ + G Gᵀ acceleration_variance
         v ← v + a T             F = (1 T; 0 1), G = (½T², T)
@@ -120,7 +119,7 @@ class PX4TargetFilter(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from 4 ms | predict, take a new measurement |
+    | update | every 20 ms from 0 | predict, take a new measurement |
     """
 
     def __init__(self, config: PX4TargetConfig, seed: int = 0):
@@ -247,7 +246,7 @@ class PX4VisionTargetFilter(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from 4 ms | predict, take a new measurement, keep a snapshot |
+    | update | every 20 ms from 0 | predict, take a new measurement, keep a snapshot |
     """
 
     def __init__(self, config: PX4VisionTargetConfig, seed: int = 0):
@@ -294,5 +293,5 @@ def _declare(
     target = system.DeclareDiscreteState(BasicVector(no_target()))
     system.DeclareDiscreteState(BasicVector(memory))
     system.DeclareStateOutputPort("target", target)
-    system.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, update)
+    system.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, update)
     return measurement.Eval, estimate.Eval

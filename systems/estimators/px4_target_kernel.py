@@ -253,7 +253,7 @@ VISION_PARAMETERS = Layout(
         "period",  # s
     ),
 )
-SNAPSHOTS = 32  # 0.5 s of 16 ms
+SNAPSHOTS = 32  # 0.64 s of 20 ms
 VISION_MEMORY = Layout(
     "PX4VisionTargetMemory",
     (

@@ -34,6 +34,10 @@ _USED_IN = (
     {0, 1, 2, 3, 4},
 )
 _NOTHING = tuple(no_measurement(layout) for _, layout in FILTER_INPUTS)
+_READ_IN = [
+    [index for index, used in enumerate(_USED_IN) if phase in used and index != 6]
+    for phase in range(7)
+]
 
 
 @configuration
@@ -45,20 +49,20 @@ class RunwayImprovedFilterConfig:
     tilt: NonNegative = 0.15  # mrad, D/ω_S for 0.033 deg/h
     tilt_walk: NonNegative = 5e-6  # rad/√s: 0.033 deg/h over half an hour
     altitude_walk: NonNegative = 0.01  # m/√s
-    camera_bearing: NonNegative = 0.37  # deg, harmonisation 0.3, heading 0.2, click 0.075
+    camera_bearing: NonNegative = 0.31  # deg, harmonisation 0.3, click 0.075
     camera_elevation: NonNegative = 0.32  # deg, harmonisation 0.3, pitch 0.05, click 0.075
     camera_walk: NonNegative = 0.02  # mrad/√s, of both
     click: NonNegative = 1.5  # px
-    # px; the tracker's noise is a pixel. Bearing, its bias and the speed across are told apart by
-    # little on a straight path, and each new linearisation pretends to know them better: more
-    # than the noise keeps the filter honest (its NEES) and costs no accuracy
-    bearing_noise: Positive = 8.0
-    elevation_noise: Positive = 5.0
-    camera_shift: Metres = 0.1  # m, position of the camera
+    bearing_noise: Positive = 1.2  # px; the tracker's is a pixel
+    elevation_noise: Positive = 1.2  # px
+    camera_shift: Metres = 0.05  # m, position of the camera
+    picture_correlation: Positive = 40.0  # pictures that tell as much as one of roll and position
     antenna_azimuth: NonNegative = 0.5  # deg
     antenna_elevation: NonNegative = 0.3  # deg
     antenna_noise: Positive = 0.25  # deg
     altimeter_scale: NonNegative = 0.01  # 1
+    heading: NonNegative = 0.2  # deg, bias of the inertial heading
+    roll: NonNegative = 0.3  # deg, of camera and inertial navigation together
     laser_noise: Positive = 0.15  # m, with the bias
     terrain: NonNegative = 0.03  # 1, elevation per distance from the flat part
     flat_within: Metres = 250.0  # m before the touch-down point
@@ -91,10 +95,13 @@ class RunwayImprovedFilterConfig:
                 math.radians(self.antenna_azimuth),
                 math.radians(self.antenna_elevation),
                 self.altimeter_scale,
+                math.radians(self.heading),
+                math.radians(self.roll),
                 self.click * optics[2],
                 (self.bearing_noise * optics[2]) ** 2,
                 (self.elevation_noise * optics[3]) ** 2,
                 self.camera_shift,
+                self.picture_correlation,
                 math.radians(self.antenna_noise) ** 2,
                 self.laser_noise**2,
                 self.terrain,
@@ -179,24 +186,21 @@ class RunwayImprovedFilter(LeafSystem):
         """Take a new tuning and runway."""
         self._parameters = config.parameters(runway or RunwayConfig())
 
+    @property
+    def model(self) -> np.ndarray:
+        """The flat parameters of the kernel."""
+        return self._parameters
+
     def _step(self, context, discrete_state):
-        phase = int(self._inputs[6].Eval(context)[0])
-        inertial, baro, fix, antenna, picture, laser, _, heading, wheels, airspeed = (
-            port.Eval(context) if phase in used else nothing
-            for port, used, nothing in zip(self._inputs, _USED_IN, _NOTHING, strict=True)
-        )
-        step(
+        phase = self._inputs[6].Eval(context)[0]
+        values = list(_NOTHING)
+        for index in _READ_IN[int(phase)]:
+            values[index] = self._inputs[index].Eval(context)
+        values[6] = phase
+        arguments = [
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
-            inertial,
-            baro,
-            fix,
-            antenna,
-            picture,
-            laser,
-            float(phase),
-            heading,
-            wheels,
-            airspeed,
+            *values,
             self._parameters,
-        )
+        ]
+        step(*arguments)

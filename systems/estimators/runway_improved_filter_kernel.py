@@ -1,14 +1,16 @@
 """The improved filter (what Leonard 2016, chapter 7 leaves to do) as a pure function of arrays.
 
-Twelve states: the thesis's five errors and the constant errors that its tuning
+Thirteen states: the thesis's five errors and the constant errors that its tuning
 hides in a hundredfold measurement noise,
 
-    x = (ϵX, ϵY, ϵZ, ϵVN, ϵVE, ϵφN, ϵφE, β, ε, a, e, s)
+    x = (ϵX, ϵY, ϵZ, ϵVN, ϵVE, ϵφN, ϵφE, β, ε, a, e, s, ϵψ)
 
 with the attitude error of the inertial navigation (11), the camera's bearing
-and elevation bias β and ε (harmonisation, heading and pitch bias, the
-operator's click), the antenna's azimuth and elevation bias a and e, and the
-altimeter's scale factor s. Between measurements
+and elevation bias β and ε (harmonisation, pitch bias, the operator's click), the
+antenna's azimuth and elevation bias a and e, the altimeter's scale factor s and
+the heading's bias ϵψ. In level flight β and ϵψ look alike; in a bank the
+heading's bias moves the elevation, too, and a filter that takes both for one becomes
+sure of a wrong position. Between measurements
 
     ϵP′ = ϵV,  ϵZ′ = s V_Z,  ϵV′ = −g ϵφ,  ϵφ′ = ϵV/R_T + noise
 
@@ -22,6 +24,8 @@ altimeter's scale factor s. Between measurements
   is taken with a covariance that explains it: the filter might be the wrong one.
 * **Antenna**: azimuth and elevation; with the altitude known, the elevation is
   a distance. Used in the air all the time.
+* **Roll and place of the camera** are constant but no states: their share of the
+  noise counts as often as pictures come in a second or two.
 * **Laser**: its noise grows with the distance from the runway, for nobody knows
   the terrain there, and is multiplied for being correlated from sample to sample.
 * **Wind and magnetic declination**: averages of what air data, compass and
@@ -37,7 +41,7 @@ from numba import njit
 from systems.estimators.runway_kalman import fuse, innovation_variance, sight, write_covariance
 from systems.runway_frames import EARTH_RADIUS, GRAVITY, angles_from_pixel, wrap_angle
 
-STATES = 12
+STATES = 13
 HISTORY = 128  # entries of inertial navigation kept, 1.28 s
 _ENTRY = 7  # time, X, Y, Z, yaw, pitch, roll
 
@@ -66,10 +70,13 @@ MEMORY = _HISTORY + _ENTRY * HISTORY
     ANTENNA_AZIMUTH,  # rad
     ANTENNA_ELEVATION,  # rad
     SCALE,  # 1
+    HEADING,  # rad
+    ROLL,  # rad, of camera and inertial navigation together, not estimated
     CLICK,  # rad, a new click
     R_BEARING,  # rad2
     R_ELEVATION,  # rad2
     CAMERA_SHIFT,  # m, of the camera's position
+    PICTURE_CORRELATION,  # pictures, for what is constant but no state
     R_ANTENNA,  # rad2
     R_LASER,  # m2
     TERRAIN,  # 1, standard deviation of the elevation per distance
@@ -87,9 +94,9 @@ MEMORY = _HISTORY + _ENTRY * HISTORY
     FOV_V,  # rad
     IFOV_H,  # rad/px
     IFOV_V,  # rad/px
-) = range(31)
-CAMERA = 31  # position (3, m) and mounting (3, rad)
-PARAMETERS = 37
+) = range(34)
+CAMERA = 34  # position (3, m) and mounting (3, rad)
+PARAMETERS = 40
 
 
 def initial_memory() -> np.ndarray:
@@ -263,10 +270,11 @@ def _fuse_fix(estimate, memory, x, P, inertial, fix, parameters):
             parameters[ANTENNA_AZIMUTH],
             parameters[ANTENNA_ELEVATION],
             parameters[SCALE],
+            parameters[HEADING],
         )
         for i in range(5):
             P[i, i] = R[i]
-        for i in range(7):
+        for i in range(8):
             P[5 + i, 5 + i] = sigmas[i] ** 2
         return
     prior = x.copy()
@@ -334,8 +342,13 @@ def _fuse_picture(estimate, memory, x, P, picture, now, parameters):
     )
     seen = angles_from_pixel(picture[4], picture[5], parameters[FOV_H : FOV_H + 4])
     d2 = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-    shift = parameters[CAMERA_SHIFT] ** 2 / d2
-    R = (parameters[R_BEARING] + shift, parameters[R_ELEVATION] + shift)
+    many = parameters[PICTURE_CORRELATION]
+    shift = many * parameters[CAMERA_SHIFT] ** 2 / d2
+    # a roll error turns the picture about its centre
+    R = (
+        parameters[R_BEARING] + shift + many * (parameters[ROLL] * seen[1]) ** 2,
+        parameters[R_ELEVATION] + shift + many * (parameters[ROLL] * seen[0]) ** 2,
+    )
     rows = np.zeros((2, STATES))
     innovations = np.empty(2)
     for k in range(2):
@@ -343,8 +356,10 @@ def _fuse_picture(estimate, memory, x, P, picture, now, parameters):
         rows[k, 3] = -age * G[k, 0]
         rows[k, 4] = -age * G[k, 1]
         rows[k, 7 + k] = 1.0
-    innovations[0] = wrap_angle(seen[0] - bearing - x[7])
-    innovations[1] = seen[1] - elevation - x[8]
+        # a heading bias turns the sight line about the vertical, also in a bank
+        rows[k, 12] = p[1] * G[k, 0] - p[0] * G[k, 1]
+    innovations[0] = wrap_angle(seen[0] - bearing - x[7] - rows[0, 12] * x[12])
+    innovations[1] = seen[1] - elevation - x[8] - rows[1, 12] * x[12]
     lost = now - memory[_ACCEPTED] > parameters[PATIENCE]
     faulty = False
     for k in range(2):

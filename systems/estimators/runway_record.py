@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 from pydantic import Field
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
 
 from systems.configuration import Positive, StructureChangedError, configuration
 from systems.runway_frames import RunwayConfig
@@ -65,10 +65,15 @@ class RunwayRecordConfig:
     )
 
     def add_to(
-        self, builder: DiagramBuilder, name: str, seed: int, runway: RunwayConfig | None = None
+        self,
+        builder: DiagramBuilder,
+        name: str,
+        seed: int,
+        runway: RunwayConfig | None = None,
+        time_limit: float = math.inf,
     ) -> "RunwayRecord":
         """Add the observer to a builder."""
-        return builder.AddNamedSystem(name, RunwayRecord(self, seed, runway))
+        return builder.AddNamedSystem(name, RunwayRecord(self, seed, runway, time_limit))
 
 
 @njit(cache=True)
@@ -168,15 +173,19 @@ class RunwayRecord(LeafSystem):
 
     | event | when | what |
     |---|---|---|
-    | note | every 40 ms from 0 | what has happened since |
+    | note | every 40 ms from 0 | what has happened since; ends the simulation at the time limit |
     """
 
     def __init__(
-        self, config: RunwayRecordConfig, seed: int = 0, runway: RunwayConfig | None = None
+        self,
+        config: RunwayRecordConfig,
+        seed: int = 0,
+        runway: RunwayConfig | None = None,
+        time_limit: float = math.inf,
     ):
         super().__init__()
         self._config = config
-        self.configure(config, seed, runway)
+        self.configure(config, seed, runway, time_limit)
         self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
         self._estimate = self.DeclareVectorInputPort("estimate", NAVIGATION_ESTIMATE.size)
         self._phase = self.DeclareVectorInputPort("phase", PHASE_STATUS.size)
@@ -191,9 +200,13 @@ class RunwayRecord(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(PICTURE_PERIOD, 0.0, self._note)
 
     def configure(
-        self, config: RunwayRecordConfig, seed: int = 0, runway: RunwayConfig | None = None
+        self,
+        config: RunwayRecordConfig,
+        seed: int = 0,
+        runway: RunwayConfig | None = None,
+        time_limit: float = math.inf,
     ) -> None:
-        """Take new distances, as many as before, and a new runway."""
+        """Take new distances, as many as before, a new runway and a time limit (s)."""
         if len(config.distances) != len(self._config.distances):
             raise StructureChangedError(
                 f"RunwayRecordConfig.distances has {len(self._config.distances)} entries in the "
@@ -202,6 +215,7 @@ class RunwayRecord(LeafSystem):
         self._config = config
         self._distances = np.array(config.distances)
         self._heading = (runway or RunwayConfig()).heading_radians
+        self._time_limit = time_limit
 
     def _note(self, context, discrete_state):
         passages = discrete_state.get_mutable_value(0)
@@ -215,3 +229,6 @@ class RunwayRecord(LeafSystem):
             self._heading,
             context.get_time(),
         )
+        if context.get_time() >= self._time_limit:
+            return EventStatus.ReachedTermination(self, "time limit")
+        return EventStatus.Succeeded()

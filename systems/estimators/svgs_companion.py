@@ -48,7 +48,7 @@ class SvgsCompanion(Diagram):
     | `measurement` | `TARGET_MEASUREMENT` | one sighting of it |
     | `external_vision` | `EXTERNAL_VISION` | the vehicle's position, for the navigation filter |
 
-    A packet takes one period of 16 ms in each node, on top of the 175 to 230 ms of the paper.
+    A packet takes one period of 20 ms in each node, on top of the 175 to 230 ms of the paper.
     """
 
     def __init__(self, config: SvgsCompanionConfig, seed: int = 0):

@@ -12,7 +12,6 @@ from pydrake.systems.framework import (
 
 from systems.configuration import configuration
 from systems.estimators.fused_sensor import POLL_PERIOD
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import SVGS, TIME_OF_ARRIVAL, VALID, no_measurement
 from systems.vision.svgs_selection import ERRORS
 
@@ -50,7 +49,7 @@ class SvgsDeserializer(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from ESTIMATE_OFFSET | take a new packet |
+    | update | every 20 ms from 0 | take a new packet |
     """
 
     def __init__(self, config: SvgsDeserializerConfig, seed: int = 0):
@@ -62,7 +61,7 @@ class SvgsDeserializer(LeafSystem):
         # Arrival of the newest packet, then how many there were by error code
         self.DeclareDiscreteState(BasicVector(np.array([-1.0] + len(ERRORS) * [0.0])))
         self.DeclareStateOutputPort("pose", pose)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
 
     def configure(self, config: SvgsDeserializerConfig, seed: int = 0) -> None:
         """Take over a new configuration."""

@@ -15,7 +15,6 @@ from pydrake.systems.framework import (
 
 from systems.configuration import Metres, Positive, Seconds, Vector2, Vector3, configuration
 from systems.estimators.fused_sensor import POLL_PERIOD, no_target
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import (
     EXTERNAL_VISION,
     TARGET_MEASUREMENT,
@@ -76,7 +75,7 @@ _T_RATIO, _T_REJECTED, _T_SOURCE = 18, 19, 20
 _V_P, _V_P_VARIANCE, _V_V, _V_YAW, _V_RESET_COUNTER, _V_QUALITY = 4, 7, 10, 16, 18, 19
 
 _HISTORY = 36  # where it begins: entries of time (s) and p_WB (m)
-_ENTRIES, _ENTRY = 40, 4  # times 16 ms: 0.64 s
+_ENTRIES, _ENTRY = 40, 4  # times 20 ms: 0.8 s
 MEMORY_SIZE = _HISTORY + _ENTRIES * _ENTRY
 
 # The parameters.
@@ -372,7 +371,7 @@ class SvgsFilter(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from ESTIMATE_OFFSET | take a sighting; target; vision if it is due |
+    | update | every 20 ms from 0 | take a sighting; target; vision if it is due |
     """
 
     def __init__(self, config: SvgsFilterConfig, seed: int = 0):
@@ -392,7 +391,7 @@ class SvgsFilter(LeafSystem):
         self.DeclareDiscreteState(BasicVector(memory))
         self.DeclareStateOutputPort("target", target)
         self.DeclareStateOutputPort("external_vision", vision)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
 
     def configure(self, config: SvgsFilterConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""

@@ -18,7 +18,6 @@ from plants.svgs_beacons import SvgsBeaconsConfig
 from systems.configuration import Finite, Positive, Vector3, configuration
 from systems.estimators.fused_sensor import POLL_PERIOD
 from systems.frames import quaternion_from_rotation_vector, rotation_matrix
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import (
     SVGS,
     TARGET_MEASUREMENT,
@@ -36,7 +35,7 @@ _E_Q, _E_TIME = 4, 0
 _T_P, _T_COVARIANCE, _T_SOURCE = 4, 7, 13
 
 # The history of attitudes: entries of time (s) and quaternion, the newest at `memory[0]`.
-_ENTRIES = 40  # times 16 ms: 0.64 s, longer than any packet takes
+_ENTRIES = 40  # times 20 ms: 0.8 s, longer than any packet takes
 _ENTRY = 5
 _SEEN, _NEWEST, _FIRST = 0, 1, 2
 MEMORY_SIZE = _FIRST + _ENTRIES * _ENTRY
@@ -214,7 +213,7 @@ class SvgsTransformations(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 16 ms from ESTIMATE_OFFSET | keep the attitude, take a new pose |
+    | update | every 20 ms from 0 | keep the attitude, take a new pose |
     """
 
     def __init__(self, config: SvgsTransformationsConfig, seed: int = 0):
@@ -229,7 +228,7 @@ class SvgsTransformations(LeafSystem):
         memory[_FIRST::_ENTRY] = -1.0
         self.DeclareDiscreteState(BasicVector(memory))
         self.DeclareStateOutputPort("measurement", measurement)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
 
     def configure(self, config: SvgsTransformationsConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""

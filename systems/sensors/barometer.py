@@ -11,7 +11,7 @@ from systems.configuration import Finite, Metres, NonNegative, Positive, configu
 from systems.signals.measurement import BAROMETER, BODY_STATE, no_measurement
 from systems.signals.noise import standard_normal, stream_key
 
-BAROMETER_PERIOD = 0.032  # s
+BAROMETER_PERIOD = 0.08  # s; PX4: SENS_BARO_RATE, 20 Hz
 _GRAVITY = 9.80665  # m/s2
 _SEA_LEVEL_DENSITY = 1.225  # kg/m3, ISO 2533
 
@@ -105,7 +105,7 @@ class Barometer(LeafSystem):
 
     With h the height of the body's origin above the ground plane z = 0 of W, T the
     thrust as the specific force along B's z axis shows it, n standard normal, and
-    δ = 32 ms,
+    δ = 80 ms,
 
         altitude = origin + p_WB.z + d + σ n − g,        σ = noise · dh/dp
         d⁺ = d exp(−δ/τ) + drift √(1 − exp(−2δ/τ)) n,     d(0) = drift · n
@@ -113,7 +113,7 @@ class Barometer(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 32 ms | 0 ms, phase "sense" | samples the body as it was just before |
+    | discrete update | 80 ms | 0 | samples the body as it was just before |
 
     Parameters
     ----------

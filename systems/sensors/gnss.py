@@ -226,13 +226,11 @@ class Gnss(LeafSystem):
     is what a landing at the place of take-off sees of a standalone receiver. The
     receiver's latency is the business of a `DelayLine`.
 
-    Neither 5 Hz nor 10 Hz is on the grid of periods. The event comes every 16 ms,
-    and sample k is taken by the first one at or after k/rate: after 208 and 192 ms
-    by turns, or after 112 ms once and 96 ms three times.
+    The event comes every 20 ms, and sample k is taken by the first one at or after k/rate.
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 16 ms | 0 ms, phase "sense" | if a sample is due, takes it |
+    | discrete update | 20 ms | 0 | if a sample is due, takes it |
 
     Parameters
     ----------

@@ -200,11 +200,11 @@ class Imu(LeafSystem):
     | port | layout | meaning |
     |---|---|---|
     | `body` | `BODY_STATE` | the true state of the body |
-    | `measurement` | `INERTIAL` | increments over the last 8 ms |
+    | `measurement` | `INERTIAL` | increments over the last 10 ms |
 
     With ω̄ the mean of the angular rate at the last sample and now, f̄ the mean
     specific force over the plant's last step (which is the sample's interval), Δ =
-    8 ms and n standard normal,
+    10 ms and n standard normal,
 
         Δθ = sat((I + S_g) ω̄ + b_g + σ_g n) Δ       σ² = density²/Δ + vibration²
         Δv = sat((I + S_a) f̄ + b_a + σ_a n) Δ
@@ -217,7 +217,7 @@ class Imu(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 8 ms | 0 ms, phase "sense" | samples the body as it was just before |
+    | discrete update | 10 ms | 0 | samples the body as it was just before |
 
     Parameters
     ----------

@@ -6,11 +6,9 @@ import numpy as np
 from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DiagramBuilder,
     DiscreteValues,
-    EventStatus,
     LeafSystem,
 )
 
@@ -19,6 +17,7 @@ from systems.configuration import (
     Metres,
     NonNegative,
     Positive,
+    Seconds,
     Vector3,
     configuration,
 )
@@ -34,6 +33,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 from systems.signals.noise import stream_key
+from systems.signals.optional_input import optional_input
 from systems.vision.exposure import EXPOSURE, expose, is_due
 from systems.vision.infrared_blobs import (
     MAXIMUM_SPOTS,
@@ -56,6 +56,8 @@ class FalseBeacon:
 
     position: Vector3 = Field(default_factory=lambda: [3.0, 0.0, 0.0])  # m, W
     strength: NonNegative = 1.0  # 1, brightness relative to the beacon
+    start_time: Seconds = 0.0  # s, when it begins to shine
+    end_time: Seconds | None = None  # s; null never
 
 
 @configuration
@@ -119,9 +121,9 @@ class InfraredCamera(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 16 ms | 0 ms, phase "sense" | a frame, if one is due by its rate |
+    | discrete update | 20 ms | 0 | a frame, if one is due by its rate |
 
-    So frames fall on the 16 ms grid, the first at 0, `frame_rate` a second on average
+    So frames fall on the 20 ms grid, the first at 0, `frame_rate` a second on average
     (`systems.vision.exposure.is_due`).
 
     Parameters
@@ -138,8 +140,9 @@ class InfraredCamera(LeafSystem):
         super().__init__()
         self._stream = stream
         self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BasicVector(BODY_STATE.size))
-        self._pad = self.DeclareVectorInputPort("pad", BasicVector(PAD_STATE.size))
+        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
+        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
+        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
         measurement = self.DeclareDiscreteState(no_measurement(INFRARED))
         self.DeclareDiscreteState(EXPOSURE.zeros())
         self.DeclareStateOutputPort("measurement", measurement)
@@ -161,14 +164,27 @@ class InfraredCamera(LeafSystem):
         self._false_beacons = np.array(
             [[*lamp.position, lamp.strength] for lamp in config.false_beacons]
         ).reshape(-1, 4)
+        self._shining = np.array(
+            [
+                [lamp.start_time, np.inf if lamp.end_time is None else lamp.end_time]
+                for lamp in config.false_beacons
+            ]
+        ).reshape(-1, 2)
 
-    def _render(self, exposure: np.ndarray, frame: int) -> np.ndarray:
+    def _lamps(self, time: float) -> np.ndarray:
+        """The false beacons that shine at `time` (s)."""
+        if not len(self._shining):
+            return self._false_beacons
+        shines = (self._shining[:, 0] <= time) & (time < self._shining[:, 1])
+        return self._false_beacons[shines]
+
+    def _render(self, exposure: np.ndarray, frame: int, time: float) -> np.ndarray:
         config = self.config
         spots = np.empty((MAXIMUM_SPOTS, 4))
         count = project_spots(
             exposure,
             self._beacon,
-            self._false_beacons,
+            self._lamps(time),
             config.lamp_radius,
             config.maximum_range,
             self.camera,
@@ -176,15 +192,15 @@ class InfraredCamera(LeafSystem):
         )
         return render_spots(spots, count, self.camera, config.noise, self._key, frame)
 
-    def _update(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, values: DiscreteValues) -> None:
         config = self.config
         now = context.get_time()
         if not is_due(now, config.frame_rate):
-            return EventStatus.DidNothing()
+            return
         exposure = values.get_mutable_value(1)
         expose(
-            self._body.Eval(context),
-            self._pad.Eval(context) if self._pad.HasValue(context) else _PAD_AT_ORIGIN,
+            self._body(context),
+            self._pad(context),
             self.X_BC,
             self.camera,
             0.0,
@@ -198,7 +214,7 @@ class InfraredCamera(LeafSystem):
             write_geometric_blobs(
                 exposure,
                 self._beacon,
-                self._false_beacons,
+                self._lamps(now),
                 config.lamp_radius,
                 config.maximum_range,
                 self.camera,
@@ -209,16 +225,17 @@ class InfraredCamera(LeafSystem):
             )
         else:
             blobs = np.empty((INFRARED_BLOBS, 3))
-            image = self._render(exposure, frame)
+            image = self._render(exposure, frame, now)
             count = detect_blobs(
                 image, THRESHOLD + black_level(config.noise), config.quantised, blobs
             )
             write_blobs(blobs, count, self.camera, measurement)
-        return EventStatus.Succeeded()
 
     def _calc_image(self, context: Context, output: Value) -> None:
-        frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])
+        measurement = context.get_discrete_state(0).value()
+        frame = int(measurement[SEQUENCE_NUMBER])
         if frame < 0:  # before the first frame
             output.set_value(np.zeros((self.config.height, self.config.width), dtype=np.uint8))
         else:
-            output.set_value(self._render(context.get_discrete_state(1).value(), frame))
+            exposure = context.get_discrete_state(1).value()
+            output.set_value(self._render(exposure, frame, measurement[TIME_OF_VALIDITY]))

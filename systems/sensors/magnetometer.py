@@ -10,7 +10,7 @@ from systems.frames import rotation_matrix
 from systems.signals.measurement import BODY_STATE, MAGNETOMETER, no_measurement
 from systems.signals.noise import standard_normals, stream_key
 
-MAGNETOMETER_PERIOD = 0.032  # s
+MAGNETOMETER_PERIOD = 0.08  # s; PX4: SENS_MAG_RATE, 15 Hz
 
 
 @configuration
@@ -92,7 +92,7 @@ class Magnetometer(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 32 ms | 0 ms, phase "sense" | samples the body as it was just before |
+    | discrete update | 80 ms | 0 | samples the body as it was just before |
 
     Parameters
     ----------

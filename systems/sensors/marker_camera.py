@@ -7,11 +7,9 @@ import numpy as np
 from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DiagramBuilder,
     DiscreteValues,
-    EventStatus,
     LeafSystem,
 )
 
@@ -36,6 +34,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 from systems.signals.noise import stream_key
+from systems.signals.optional_input import optional_input
 from systems.vision.exposure import EXPOSURE, expose, is_due
 from systems.vision.marker_error_model import write_geometric_detection, write_marker_detection
 from systems.vision.nested_marker import NestedMarker, NestedMarkerDetector
@@ -119,9 +118,9 @@ class MarkerCamera(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 16 ms | 0 ms, phase "sense" | a frame, if one is due by its rate |
+    | discrete update | 20 ms | 0 | a frame, if one is due by its rate |
 
-    So frames fall on the 16 ms grid, the first at 0, `frame_rate` a second on average
+    So frames fall on the 20 ms grid, the first at 0, `frame_rate` a second on average
     (`systems.vision.exposure.is_due`).
 
     Parameters
@@ -136,8 +135,9 @@ class MarkerCamera(LeafSystem):
         super().__init__()
         self._stream = stream
         self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BasicVector(BODY_STATE.size))
-        self._pad = self.DeclareVectorInputPort("pad", BasicVector(PAD_STATE.size))
+        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
+        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
+        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
         measurement = self.DeclareDiscreteState(no_measurement(MARKER))
         self.DeclareDiscreteState(EXPOSURE.zeros())
         self.DeclareStateOutputPort("measurement", measurement)
@@ -197,15 +197,15 @@ class MarkerCamera(LeafSystem):
             measurement,
         )
 
-    def _update(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, values: DiscreteValues) -> None:
         config = self.config
         now = context.get_time()
         if not is_due(now, config.frame_rate):
-            return EventStatus.DidNothing()
+            return
         exposure = values.get_mutable_value(1)
         expose(
-            self._body.Eval(context),
-            self._pad.Eval(context) if self._pad.HasValue(context) else _PAD_AT_ORIGIN,
+            self._body(context),
+            self._pad(context),
             self.X_BC,
             self.camera,
             config.exposure_time,
@@ -228,7 +228,6 @@ class MarkerCamera(LeafSystem):
             )
         else:
             self._detect(exposure, measurement)
-        return EventStatus.Succeeded()
 
     def _calc_image(self, context: Context, output: Value) -> None:
         frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])

@@ -14,7 +14,7 @@ from systems.signals.measurement import BODY_STATE, PAD_STATE, RANGE_FINDER, no_
 from systems.signals.noise import standard_normal, stream_key
 from systems.signals.optional_input import optional_input
 
-RANGE_FINDER_PERIOD = 0.032  # s; of the lidar's 100 Hz as much as navigation takes
+RANGE_FINDER_PERIOD = 0.04  # s; of the lidar's 100 Hz as much as navigation takes
 
 
 @configuration
@@ -131,7 +131,7 @@ class RangeFinder(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | 32 ms | 0 ms, phase "sense" | samples the state of just before |
+    | discrete update | 40 ms | 0 | samples the state of just before |
 
     Parameters
     ----------

@@ -24,9 +24,11 @@ class RunwayGpsConfig:
     horizontal_noise: Metres = 1.5  # m, one sigma of each component
     vertical_noise: Metres = 3.0  # m
     speed_noise: NonNegative = 0.1  # m/s
-    # m, what the receiver says of its altitude; 0: the truth. Smaller than the noise it makes the
-    # filter trust an altitude that is wrong, as one set by a biased altimeter
-    reported_vertical_accuracy: Metres = 0.0
+    # What the fix says of itself; 0: the truth. Smaller than the noise it makes a filter trust a
+    # position, an altitude or a speed that is wrong, as one that has drifted since
+    reported_horizontal_accuracy: Metres = 0.0  # m
+    reported_vertical_accuracy: Metres = 0.0  # m
+    reported_speed_accuracy: NonNegative = 0.0  # m/s
     loss_time: Seconds = 0.0  # s, the last fix is the one at or before it
     delay: Seconds = 0.0  # s
 
@@ -41,8 +43,8 @@ class RunwayGpsConfig:
 def fix_sample(state, time, index, parameters, key):
     """One fix, shape (12,).
 
-    `parameters` are the three sigmas (m, m, m/s), the time
-    of loss (s) and the reported vertical accuracy (m; 0: the sigma).
+    `parameters` are the three sigmas (m, m, m/s), the time of loss (s), and the three
+    accuracies as reported (0: the sigma).
     """
     n = standard_normals(key, index, 5)
     fix = np.empty(12)
@@ -56,8 +58,9 @@ def fix_sample(state, time, index, parameters, key):
     fix[7] = state[3] + parameters[2] * n[3]
     fix[8] = state[4] + parameters[2] * n[4]
     fix[9:12] = parameters[:3]
-    if parameters[4] > 0.0:
-        fix[10] = parameters[4]
+    for i in range(3):
+        if parameters[4 + i] > 0.0:
+            fix[9 + i] = parameters[4 + i]
     return fix
 
 
@@ -93,7 +96,9 @@ class RunwayGps(RunwaySensor):
                 config.vertical_noise,
                 config.speed_noise,
                 config.loss_time,
+                config.reported_horizontal_accuracy,
                 config.reported_vertical_accuracy,
+                config.reported_speed_accuracy,
             ]
         )
 

@@ -187,6 +187,11 @@ class RunwayInertialDrift(LeafSystem):
         since_reset = config.longest_since_reset * uniform(stream_key(seed, stream), 0, 0)
         self._parameters = np.array([*draws, *drift_since_reset(draws[:2], since_reset)])
 
+    @property
+    def model(self) -> np.ndarray:
+        """The parameters of one run, see `inertial_sample`."""
+        return self._parameters
+
     def _sample(self, context, discrete_state):
         inertial_sample(
             discrete_state.get_mutable_value(0),

@@ -18,7 +18,7 @@ class RunwayLaserConfig:
     period: Seconds = LASER_PERIOD  # s, 10 Hz (Table 3)
     bias_spread: Metres = 0.05  # m, "a few centimeters" (3.2)
     noise: Metres = 0.1  # m, one sigma; SF11 manual: accuracy 0.1 m
-    delay: Seconds = 0.2  # s, of the filter that takes out trees and houses
+    delay: Seconds = 0.1  # s, of the filter that takes out trees and houses
     activation_height: Metres = 100.0  # m above ground (6.1, Delayed Laser Activation)
     activation_spread: Metres = 5.0  # m, one sigma of it from run to run
 

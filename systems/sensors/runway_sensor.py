@@ -75,6 +75,11 @@ class RunwaySensor(LeafSystem):
         self._key = stream_key(seed, self.stream)
         self._parameters = np.asarray(self._draw(config, seed), dtype=float)
 
+    @property
+    def model(self) -> tuple[np.ndarray, np.uint64, float, int]:
+        """Parameters of one run, noise key, delay (s) and looks between two samples."""
+        return self._parameters, self._key, self._delay, self._every
+
     def _draw(self, config: Any, seed: int) -> np.ndarray:
         raise TypeError(f"{type(self).__name__} does not say how its parameters are drawn")
 

@@ -152,6 +152,11 @@ class RunwayTracker(LeafSystem):
             ]
         )
 
+    @property
+    def model(self) -> tuple[np.ndarray, np.uint64, float]:
+        """Parameters of one run, noise key and delay (s)."""
+        return self._parameters, self._key, self._config.delay
+
     def _update(self, context, discrete_state):
         picture = self._picture.Eval(context)
         pipeline = discrete_state.get_mutable_value(1)

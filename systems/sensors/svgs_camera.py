@@ -9,11 +9,9 @@ from numba import njit
 from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DiagramBuilder,
     DiscreteValues,
-    EventStatus,
     LeafSystem,
 )
 
@@ -39,6 +37,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 from systems.signals.noise import standard_normal, stream_key, uniform
+from systems.signals.optional_input import optional_input
 from systems.vision import svgs_selection as selection
 from systems.vision.exposure import EXPOSURE, SMEAR, expose
 from systems.vision.pinhole import camera_mount, pinhole_camera
@@ -188,8 +187,9 @@ class SvgsCamera(LeafSystem):
     def __init__(self, config: SvgsCameraConfig, seed: int = 0):
         super().__init__()
         self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BasicVector(BODY_STATE.size))
-        self._pad = self.DeclareVectorInputPort("pad", BasicVector(PAD_STATE.size))
+        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
+        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
+        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
         initial = no_measurement(SVGS)
         initial[SVGS.index("beacon")] = -1.0
         initial[SVGS.index("error_code")] = selection.NO_BLOBS
@@ -259,18 +259,18 @@ class SvgsCamera(LeafSystem):
         period = min(max(period, c.shortest_period), c.longest_period)
         return period * (1.0 + c.jitter * (2.0 * uniform(self._host_key, frame, 0) - 1.0))
 
-    def _update(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, values: DiscreteValues) -> None:
         now = context.get_time()
         if now < context.get_discrete_state(2).value()[_NEXT_FRAME] - _TICK:
-            return EventStatus.DidNothing()
+            return
         measurement: Any = values.get_mutable_value(0)
         exposure: Any = values.get_mutable_value(1)
         host: Any = values.get_mutable_value(2)
         gain = host[_FRAME_GAIN] = host[_GAIN]
         exposure_time = gain * self.config.longest_exposure
         expose(
-            self._body.Eval(context),
-            self._pad.Eval(context) if self._pad.HasValue(context) else _PAD_AT_ORIGIN,
+            self._body(context),
+            self._pad(context),
             self.X_BC,
             self.camera,
             exposure_time,
@@ -314,8 +314,9 @@ class SvgsCamera(LeafSystem):
             host[_TRACK],
             measurement,
         )
-        host[_NEXT_FRAME] = now + self._period(measurement[_BLOB_COUNT], frame)
-        return EventStatus.Succeeded()
+        # From when this frame was due, not from the tick it fell on: the rate holds on average.
+        due = max(host[_NEXT_FRAME], now - CLOCK_PERIOD)
+        host[_NEXT_FRAME] = due + self._period(measurement[_BLOB_COUNT], frame)
 
     def _calc_image(self, context: Context, output: Value) -> None:
         frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])

@@ -23,7 +23,7 @@ from systems.configuration import (
     configuration,
     require_same_structure,
 )
-from systems.schedule import ESTIMATE_OFFSET, PLANT_PERIOD, on_grid
+from systems.schedule import PLANT_PERIOD, on_grid
 from systems.signals.measurement import (
     SEQUENCE_NUMBER,
     TIME_OF_ARRIVAL,
@@ -267,12 +267,12 @@ class DelayLine(LeafSystem):
     lost and counted. Every draw is a function of (seed, stream, n), so that a
     measurement that was itself duplicated upstream meets the same fate twice.
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | `period`, 8 ms by default | 4 ms, phase "estimate" | enter, release |
+    | event | when | does |
+    |---|---|---|
+    | discrete update | every `period` (10 ms by default) from 0 | enter, release |
 
-    A consumer in the phase "estimate" sees a release one period of its own later,
-    like everything that happens in its own phase.
+    A consumer sees a release one period of its own later, like everything that happens
+    on one tick.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ class DelayLine(LeafSystem):
         output = self.DeclareDiscreteState(no_measurement(layout))
         self.DeclareDiscreteState(initial)
         self.DeclareStateOutputPort("measurement", output)
-        self.DeclarePeriodicDiscreteUpdateEvent(config.period, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
 
     def configure(self, config: DelayLineConfig, seed: int) -> None:
         """Take over a new configuration; `period` and `capacity` must stay as they are."""
@@ -331,7 +331,7 @@ class DelayLine(LeafSystem):
         measurement = self._measurement(context)
         memory = discrete_state.get_mutable_value(_MEMORY)
         time = context.get_time()
-        is_new = measurement[TIME_OF_ARRIVAL] != memory[_SEEN]
-        if is_new or time >= memory[_NEXT_RELEASE] - _TOLERANCE:
+        is_new = measurement.item(TIME_OF_ARRIVAL) != memory.item(_SEEN)
+        if is_new or time >= memory.item(_NEXT_RELEASE) - _TOLERANCE:
             output = discrete_state.get_mutable_value(_OUTPUT)
             advance(time, measurement, self._keys, self._parameters, output, memory)

@@ -428,7 +428,7 @@ class FaultInjector(LeafSystem):
 
     | event | period | offset | does |
     |---|---|---|---|
-    | discrete update | `period`, 8 ms by default | 0 ms, phase "sense" | obeys, passes, drops |
+    | discrete update | `period`, 10 ms by default | 0 | obeys, passes, drops |
 
     The sensor's sample at t passes at t + period: blocks of one phase see each
     other late. A `DelayLine` behind the injector absorbs that, because it counts

@@ -280,6 +280,7 @@ SETPOINT = Layout(
         "yaw",  # rad, counter-clockwise from east
         "armed",  # 0/1, 0 stops the rotors
         "maximum_speed",  # m/s, horizontal limit on the way to p_WB
+        *vector("a_WB"),  # m/s2, feed-forward on top of what the controller asks for itself
     ),
 )
 

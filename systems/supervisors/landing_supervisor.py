@@ -28,9 +28,12 @@ from systems.signals.measurement import (
     TIME_OF_ARRIVAL,
     VALID,
     VEHICLE_ESTIMATE,
+    no_measurement,
 )
+from systems.signals.optional_input import optional_input
 from systems.supervisors.ardupilot import ArduPilotConfig
 from systems.supervisors.cautious import CautiousConfig
+from systems.supervisors.cone import ConeConfig
 from systems.supervisors.mission import Mission, MissionConfig, flight_table
 from systems.supervisors.normal import NormalConfig
 from systems.supervisors.px4_precland import PX4PreclandConfig
@@ -43,7 +46,12 @@ if TYPE_CHECKING:
     from systems.supervisors.svgs_guidance import SvgsGuidance
 
 RoutineConfig = Annotated[
-    NormalConfig | ArduPilotConfig | CautiousConfig | PX4PreclandConfig | SvgsRoutineConfig,
+    NormalConfig
+    | ArduPilotConfig
+    | CautiousConfig
+    | PX4PreclandConfig
+    | SvgsRoutineConfig
+    | ConeConfig,
     Field(discriminator="kind"),
 ]
 
@@ -87,6 +95,7 @@ _E = {field: VEHICLE_ESTIMATE.index(field) for field in VEHICLE_ESTIMATE.fields}
 _Q = VEHICLE_ESTIMATE.slice("q_WB")
 _P = VEHICLE_ESTIMATE.slice("p_WB")
 _V = VEHICLE_ESTIMATE.slice("v_WB")
+_A = VEHICLE_ESTIMATE.slice("a_WB")
 _HEIGHT, _HEIGHT_VALID = _E["height_above_ground"], _E["height_above_ground_valid"]
 _VALIDITY = slice(_E["attitude_valid"], _E["vertical_valid"] + 1)
 _H_COUNTER = _E["horizontal_reset_counter"]
@@ -96,12 +105,17 @@ _ACQUIRED = TARGET_ESTIMATE.index("acquired")
 _FUSED = TARGET_ESTIMATE.index("time_of_last_fusion")
 _P_BP = TARGET_ESTIMATE.slice("p_BP_W")
 _V_WP = TARGET_ESTIMATE.slice("v_WP")
+_P_VARIANCE = slice(
+    TARGET_ESTIMATE.index("position_variance_x"), TARGET_ESTIMATE.index("position_variance_y") + 1
+)
 _RANGE = RANGE_FINDER.index("range")
 _STATUS = SETPOINT.size  # where the status begins in the fields of `Memory`
 _REST = _STATUS + SUPERVISOR_STATUS.size
 _SETPOINT_NUMBERS = Struct(f"{SETPOINT.size}d")
 _STATUS_NUMBERS = Struct(f"{SUPERVISOR_STATUS.size}d")
 _AXES = ("_x", "_y", "_z")  # endings of the names of positions
+_NEVER_SEEN = TARGET_ESTIMATE.zeros()
+_NO_RANGE = no_measurement(RANGE_FINDER)
 
 
 class LandingSupervisor(LeafSystem):
@@ -139,7 +153,7 @@ unconnected: touchdown is judged by motion alone |
 
     | event | when | does |
     |---|---|---|
-    | update | every 32 ms from 0 | inputs, resets, sightings, touchdown, one transition at most |
+    | update | every 40 ms from 0 | inputs, resets, sightings, touchdown, one transition at most |
     """
 
     def __init__(self, config: LandingSupervisorConfig, seed: int = 0):
@@ -147,9 +161,16 @@ unconnected: touchdown is judged by motion alone |
         super().__init__()
         self._build(config)
         self._estimate = self.DeclareVectorInputPort("estimate", VEHICLE_ESTIMATE.size).Eval
-        self.DeclareVectorInputPort("target", TARGET_ESTIMATE.size)
-        self.DeclareVectorInputPort("range_finder", RANGE_FINDER.size)
-        self.DeclareVectorInputPort("rotor_commands", config.rotor_count)
+        self._target = optional_input(
+            self.DeclareVectorInputPort("target", TARGET_ESTIMATE.size), _NEVER_SEEN
+        )
+        self._range_finder = optional_input(
+            self.DeclareVectorInputPort("range_finder", RANGE_FINDER.size), _NO_RANGE
+        )
+        self._commands = optional_input(
+            self.DeclareVectorInputPort("rotor_commands", config.rotor_count),
+            np.full(config.rotor_count, math.nan),
+        )
         initial = np.array(self._routine.memory.initial())
         setpoint = self.DeclareDiscreteState(BasicVector(initial[:_STATUS]))
         status = self.DeclareDiscreteState(BasicVector(initial[_STATUS:_REST]))
@@ -223,25 +244,23 @@ unconnected: touchdown is judged by motion alone |
         w, x, y, z = estimate[_Q]
         s.x, s.y, s.z = estimate[_P]
         s.vx, s.vy, s.vz = estimate[_V]
+        s.ax, s.ay, s.az = estimate[_A]
+        s.up_x, s.up_y = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+        s.up_z = 1.0 - 2.0 * (x * x + y * y)
         s.yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         s.navigation_valid = min(estimate[_VALIDITY]) > 0.0
         self._follow_resets(m, estimate)
 
-        measured = self.EvalVectorInput(context, 2)
-        if measured is not None:
-            ranging = measured.value().tolist()
-            if ranging[VALID] > 0.0 and s.time - ranging[TIME_OF_ARRIVAL] <= (
-                self.config.range_timeout
-            ):
-                s.range_valid = s.height_measured = True
-                s.height = ranging[_RANGE] * (1.0 - 2.0 * (x * x + y * y))
-        if not s.range_valid:
+        ranging = self._range_finder(context).tolist()
+        age = s.time - ranging[TIME_OF_ARRIVAL]
+        if ranging[VALID] > 0.0 and age <= self.config.range_timeout:
+            s.range_valid = s.height_measured = True
+            s.height = ranging[_RANGE] * s.up_z
+        else:
             s.height_measured = estimate[_HEIGHT_VALID] > 0.0
             s.height = estimate[_HEIGHT] if s.height_measured else s.z - m.home_z
 
-        commands = self.EvalVectorInput(context, 3)
-        if commands is not None:
-            s.command = sum(commands.value().tolist()) / self.config.rotor_count
+        s.command = sum(self._commands(context).tolist()) / self.config.rotor_count
 
     def _follow_resets(self, m: Memory, estimate: list[float]) -> None:
         if estimate[_H_COUNTER] != m.horizontal_resets:
@@ -255,16 +274,14 @@ unconnected: touchdown is judged by motion alone |
             m.vertical_resets = estimate[_V_COUNTER]
 
     def _perceive_target(self, context: Context, s: Situation[Any]) -> None:
-        sensed = self.EvalVectorInput(context, 1)
-        if sensed is None:
-            return
         m = s.memory
-        target = sensed.value().tolist()
+        target = self._target(context).tolist()
         s.acquired = target[_ACQUIRED] > 0.0
         if not s.acquired:
             return
         to_pad_x, to_pad_y, to_pad_z = target[_P_BP]
-        s.pad_vx, s.pad_vy, _ = target[_V_WP]
+        s.pad_vx, s.pad_vy, s.pad_vz = target[_V_WP]
+        s.goal_sigma = math.sqrt(max(target[_P_VARIANCE]))
         ahead, left, _ = self.config.reference_point
         c, n = math.cos(s.yaw), math.sin(s.yaw)
         s.goal_x = s.x + to_pad_x - (c * ahead - n * left)

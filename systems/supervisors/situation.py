@@ -27,6 +27,9 @@ class Memory:
     setpoint_yaw: float = math.nan  # rad
     armed: float = 0.0
     maximum_speed: float = 0.0  # m/s
+    setpoint_ax: float = 0.0  # m/s2
+    setpoint_ay: float = 0.0
+    setpoint_az: float = 0.0
 
     state: float = 0.0
     time_in_state: float = 0.0  # s
@@ -102,8 +105,14 @@ class Situation(Generic[M]):
     goal_x, goal_y, goal_z : float
         Where the vehicle's origin must go to bring its reference point over the target (x, y),
         and the height of the target itself (z), in W as of now, m; NaN before the first sighting.
-    pad_vx, pad_vy : float
+    goal_sigma : float
+        One sigma of the target's horizontal place, the larger axis, m.
+    pad_vx, pad_vy, pad_vz : float
         The velocity of the pad itself, m/s.
+    ax, ay, az : float
+        The estimated acceleration in W, m/s2.
+    up_x, up_y, up_z : float
+        The body's z axis in W, along which the rotors push.
     command : float
         Mean rotor command; NaN where not known.
     """
@@ -121,7 +130,10 @@ class Situation(Generic[M]):
         self.acquired = False
         self.updated = False
         self.goal_x = self.goal_y = self.goal_z = math.nan
-        self.pad_vx = self.pad_vy = 0.0
+        self.goal_sigma = math.nan
+        self.pad_vx = self.pad_vy = self.pad_vz = 0.0
+        self.ax = self.ay = self.az = 0.0
+        self.up_x, self.up_y, self.up_z = 0.0, 0.0, 1.0
         self.command = math.nan
 
     def distance_to(self, x: float, y: float) -> float:

@@ -48,7 +48,7 @@ class SvgsCommander(LandingSupervisor):
 
     | event | when | does |
     |---|---|---|
-    | update | every 32 ms from 0 | as in `LandingSupervisor` |
+    | update | every 40 ms from 0 | as in `LandingSupervisor` |
     """
 
     def __init__(self, config: "LandingSupervisorConfig", seed: int = 0):

@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from systems.schedule import ESTIMATE_OFFSET, SUPERVISOR_PERIOD
+from systems.schedule import SUPERVISOR_PERIOD
 from systems.signals.measurement import SETPOINT, VEHICLE_ESTIMATE, Layout
 from systems.supervisors import svgs_routine as routine
 from systems.supervisors.svgs_routine import COMMAND, SvgsRoutineConfig
@@ -123,7 +123,7 @@ class SvgsMotionControl(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every 32 ms from ESTIMATE_OFFSET (paper: 30 Hz) | the next setpoint, if due |
+    | update | every 40 ms from 0 (paper: 30 Hz) | the next setpoint, if due |
     """
 
     def __init__(self, config: SvgsRoutineConfig, seed: int = 0):
@@ -143,7 +143,7 @@ class SvgsMotionControl(LeafSystem):
         self.DeclareDiscreteState(BasicVector(np.asarray(memory[:])))
         self.DeclareStateOutputPort("setpoint", setpoint)
         self.DeclareStateOutputPort("feedback", feedback)
-        self.DeclarePeriodicDiscreteUpdateEvent(SUPERVISOR_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(SUPERVISOR_PERIOD, 0.0, self._update)
         self._manoeuvres: dict[int, Callable[[Motion], None]] = {
             routine.HOLD: self.hold,
             routine.SCAN: self.scan,

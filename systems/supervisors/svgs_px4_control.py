@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
 )
 
 from systems.configuration import Positive, configuration
-from systems.schedule import CLOCK_PERIOD, ESTIMATE_OFFSET
+from systems.schedule import CLOCK_PERIOD
 from systems.signals.measurement import SETPOINT
 from systems.supervisors.situation import Memory
 from systems.supervisors.svgs_routine import COMMAND, NONE
@@ -57,7 +57,7 @@ class Px4Control(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every CLOCK_PERIOD from ESTIMATE_OFFSET | send, if 1 / rate has passed |
+    | update | every CLOCK_PERIOD from 0 | send, if 1 / rate has passed |
     """
 
     def __init__(self, config: Px4ControlConfig, seed: int = 0):
@@ -70,7 +70,7 @@ class Px4Control(LeafSystem):
         initial = Memory.initial()[: SETPOINT.size]
         self.DeclareStateOutputPort("setpoint", self.DeclareDiscreteState(BasicVector(initial)))
         self.DeclareDiscreteState(1)  # s, when the next setpoint is due
-        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
 
     def configure(self, config: Px4ControlConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""

@@ -10,6 +10,7 @@ Where the paper leaves it open:
 * A beacon that is not seen again after both relocations is waited for, then scanned for with
   growing squares. When the last square is done the vehicle lands without sight, over the place
   of the pad as it was last known, or where it is if the pad was never seen.
+* After `maximum_relocations` the next loss of sight ends in the same way.
 * Below `final_height` nothing is relocated any more (the paper's U_min): the landing goes on.
 * The vehicle counts as aligned within `align_radius` + `align_slope` · height of the point it
   aligns with, and as not aligned any more beyond twice that.
@@ -115,6 +116,7 @@ class SvgsRoutine:
             ),
             Transition("scan", "scan", "scanned_and_may_scan"),
             Transition("scan", "land_without_sight", "scanned"),
+            *transitions_from(("align", "descend"), "land_without_sight", "lost_too_often"),
             *transitions_from(("align", "descend"), "relocate_xy", "lost_above_minimum"),
             Transition("align", "land", "lost_below_minimum"),
             Transition("align", "descend", "aligned"),
@@ -186,6 +188,11 @@ class SvgsRoutine:
     def lost_above_minimum(self, s: S) -> bool:
         """Sight is lost, high enough to relocate."""
         return self._lost(s) and self.height(s) >= self.config.final_height
+
+    def lost_too_often(self, s: S) -> bool:
+        """Sight is lost again after as many relocations as there may be."""
+        relocations = s.memory.attempts - 1.0
+        return self._lost(s) and relocations >= self.config.maximum_relocations
 
     def lost_below_minimum(self, s: S) -> bool:
         """Sight is lost, too low to relocate."""
@@ -325,6 +332,8 @@ class SvgsRoutineConfig:
     relocation_time: Seconds = 2.0  # s
     relocation_radius: Metres = 0.5  # m, at which it is reached, at any time; not published
     relocation_timeout: Seconds = 15.0  # s, for the way there; not published
+    # Beacons that are seen from above but not on the way down shall not keep it in the air
+    maximum_relocations: int = Field(default=5, ge=0)  # not published
     lost_time: Seconds = 0.5  # s without a target estimate; not published
     wait_time: Seconds = 8.0  # s, at the trusted pose before a new scan; not published
     # Algorithm 5: two requests, 2.5 s apart

@@ -8,6 +8,7 @@ by the pixel's footprint on the ground, so that far markings fade and do not fli
 
 import math
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -142,3 +143,33 @@ def draw_picture(
             shade += noise * 1.7320508 * grain
             picture[row, column] = min(max(shade + 0.5, 0.0), 255.0)
     return picture
+
+
+def draw_tracked_point(
+    picture: np.ndarray, point: tuple[float, float] | None, caption: str
+) -> np.ndarray:
+    """Draw the tracked touch-down point as the operator sees it (Fig. 10): a cross in a box.
+
+    Parameters
+    ----------
+    picture : array of uint8, shape (rows, columns)
+    point : tuple of float, optional
+        u, v of Eq. 14, px; None where the tracker has no point.
+    caption : str
+        Written into the lower left corner.
+
+    Returns
+    -------
+    array of uint8, shape (rows, columns, 3)
+        Blue, green, red.
+    """
+    canvas = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    if point is not None:
+        u, v = round(point[0] - 0.5), round(point[1] - 0.5)
+        cv2.drawMarker(canvas, (u, v), (40, 60, 230), cv2.MARKER_CROSS, 16, 1, cv2.LINE_AA)
+        cv2.rectangle(canvas, (u - 24, v - 24), (u + 24, v + 24), (66, 228, 240), 1)
+    text = caption if point is not None else f"{caption}, not tracked"
+    place = (10, picture.shape[0] - 12)
+    for colour, width in (((24, 24, 24), 3), ((255, 255, 255), 1)):
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_DUPLEX, 0.6, colour, width, cv2.LINE_AA)
+    return canvas

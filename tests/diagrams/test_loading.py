@@ -118,3 +118,17 @@ def test_a_binary_file_is_refused(tmp_path):
     file.write_bytes(bytes(range(256)))
     with pytest.raises(ScenarioError, match="UTF-8"):
         load_scenario(file)
+
+
+def test_overrides_are_not_written_into():
+    """A path below a map that is overridden as a whole must not change the caller's map."""
+    wind = {"speed": 1.0}
+    overrides = {"wind": wind, "wind.speed": 2.0}
+    assert load_scenario("infrared-and-marker", overrides).wind.speed == 2.0
+    assert wind == {"speed": 1.0}
+    aircraft = {"kind": "recorded_flight", "altitude_error": 4.0}
+    final = load_scenario("landing-without-gps-final")
+    for _ in range(2):
+        assert with_overrides(final, {"aircraft": aircraft}).aircraft.altitude_error == 4.0
+        changed = with_overrides(final, {"aircraft": aircraft, "aircraft.altitude_error": 0.0})
+        assert changed.aircraft.altitude_error == 0.0

@@ -43,7 +43,7 @@ def test_topology():
     multirotor = Multirotor(MultirotorConfig(vehicle="dr_spider"))
     assert multirotor.GetInputPort("rotor_commands").size() == 8
     assert multirotor.GetOutputPort("rotor_speeds").size() == 8
-    assert periodic_update(multirotor) == (0.008, 0.0)
+    assert periodic_update(multirotor) == (0.01, 0.0)
 
 
 def test_topology_of_the_continuous_system():

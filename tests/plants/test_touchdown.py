@@ -35,9 +35,9 @@ class Judge:
         self.disarmed = False
         self.rotors = np.zeros(6)
 
-    def look(self, height=0.2, contact=0.0, v_WB=(0, 0, 0), rotors=0.0, seconds=0.016):
+    def look(self, height=0.2, contact=0.0, v_WB=(0, 0, 0), rotors=0.0, seconds=0.04):
         self.body[6], self.body[16], self.body[7:10], self.rotors[:] = height, contact, v_WB, rotors
-        for _ in range(max(1, round(seconds / 0.016))):
+        for _ in range(max(1, round(seconds / 0.04))):
             rules.judge(
                 self.verdict,
                 self.memory,
@@ -48,13 +48,13 @@ class Judge:
                 self.time,
                 self.parameters,
             )
-            self.time += 0.016
+            self.time += 0.04
         return TOUCHDOWN(self.verdict)
 
     def fly_and_touch(self, speed=0.5, v_x=0.1):
         self.look(contact=24.5)
         self.look(height=3.0, rotors=600.0)
-        self.look(height=0.21, v_WB=(v_x, 0, -speed), rotors=600.0, seconds=0.032)
+        self.look(height=0.21, v_WB=(v_x, 0, -speed), rotors=600.0, seconds=0.08)
         return self.look(height=0.199, contact=30.0, v_WB=(0, 0, -0.2), rotors=500.0)
 
 
@@ -69,7 +69,7 @@ class TestRules:
     def test_touchdown_and_rest(self):
         judge = Judge()
         verdict = judge.fly_and_touch()
-        assert verdict.time == pytest.approx(0.064)
+        assert verdict.time == pytest.approx(0.16)
         assert verdict.vertical_speed == 0.5
         assert verdict.horizontal_speed == pytest.approx(0.1)
         assert judge.look(contact=24.5, rotors=100.0, seconds=3.0).landed == 0.0
@@ -101,7 +101,7 @@ class TestRules:
         judge = Judge()
         judge.fly_and_touch(speed=0.9)
         assert judge.look(height=1.0, rotors=600.0).time == -1.0
-        judge.look(height=0.21, v_WB=(0, 0, -0.3), rotors=600.0, seconds=0.032)
+        judge.look(height=0.21, v_WB=(0, 0, -0.3), rotors=600.0, seconds=0.08)
         verdict = judge.look(height=0.199, contact=25.0, rotors=500.0)
         assert verdict.vertical_speed == pytest.approx(0.3)
 
@@ -197,7 +197,7 @@ class TestSystem:
     def test_topology(self):
         observer = TouchdownObserver(TouchdownConfig(), seed=1)
         assert assert_matches_docstring(observer).optional == {"pad", "supervisor"}
-        assert periodic_update(observer) == (0.016, 0.0)
+        assert periodic_update(observer) == (0.04, 0.0)
         eight = TouchdownObserver(TouchdownConfig(rotor_count=8))
         assert eight.GetInputPort("rotor_speeds").size() == 8
 
@@ -259,7 +259,7 @@ class TestSystem:
         simulator = Simulator(diagram)
         status = simulator.AdvanceTo(30.0)
         assert status.reason() == TERMINATED
-        assert 0.3 <= simulator.get_context().get_time() < 0.45
+        assert 0.3 <= simulator.get_context().get_time() < 0.5
         assert verdict_of(observer, simulator).reason == rules.NEVER_TOOK_OFF
 
     def test_configure(self):

@@ -72,7 +72,7 @@ def test_the_first_sample_is_stationary():
     for seed in range(len(samples)):
         state = np.zeros(6)
         dynamics.update(
-            samples[seed], state, 30.48, np.zeros(3), 0.0, 0.032, np.uint64(seed), parameters
+            samples[seed], state, 30.48, np.zeros(3), 0.0, 0.04, np.uint64(seed), parameters
         )
         assert np.isfinite(state).all()
     expected = np.array([1.716, 1.716, 1.0])
@@ -159,9 +159,9 @@ def wind_after(config, seconds, seed=0, body=None):
 def test_a_scheduled_gust_is_one_minus_cosine():
     gust = GustConfig(start=1.0, duration=2.0, velocity=[4.0, -2.0, 1.0])
     config = WindConfig(speed=2.0, turbulence=0.0, gusts=[gust])
-    # The wind after the last event at 0.032 k is that for 0.032 (k + 1).
+    # The wind after the last event at 0.04 k is that for 0.04 (k + 1).
     for seconds in (0.5, 1.5, 2.0, 2.7, 3.5):
-        time = 0.032 * math.floor(seconds / 0.032 + 1.0 + 1e-9)
+        time = 0.04 * math.floor(seconds / 0.04 + 1.0 + 1e-9)
         share = 0.5 * (1 - math.cos(math.pi * (time - 1.0))) if 1.0 < time < 3.0 else 0.0
         expected = np.array([2.0, 0.0, 0.0]) + share * np.array([4.0, -2.0, 1.0])
         np.testing.assert_allclose(wind_after(config, seconds + 1e-4), expected, atol=1e-9)
@@ -180,7 +180,7 @@ class TestSystem:
     def test_topology(self):
         wind = Wind(WindConfig(), seed=1)
         assert assert_matches_docstring(wind).optional == {"body"}
-        assert periodic_update(wind) == (0.032, 0.0)
+        assert periodic_update(wind) == (0.04, 0.0)
 
     def test_initial_state_is_calm_and_so_is_the_default(self):
         wind = Wind(WindConfig(speed=9.0), seed=1)
@@ -194,9 +194,9 @@ class TestSystem:
         body[BODY_STATE.index("p_WB_z")] = 20.0
         expected, state = np.zeros(3), np.zeros(6)
         key = stream_key(4, "wind.turbulence")
-        for k in range(4):
+        for k in range(3):
             dynamics.update(
-                expected, state, 20.0, np.zeros(3), 0.032 * (k + 1), 0.032, key, config.parameters()
+                expected, state, 20.0, np.zeros(3), 0.04 * (k + 1), 0.04, key, config.parameters()
             )
         np.testing.assert_array_equal(wind_after(config, 0.1, seed=4, body=body), expected)
         assert expected[2] != 0.0

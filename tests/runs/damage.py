@@ -2,6 +2,7 @@
 
 import gzip
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from runs.replay_diagnosis import diagnosis, summaries
 from runs.replay_tables import against_on_board
 from runs.ulog import write_ulog
 
+Topics = dict[str, np.ndarray]
 _WORDS = (b"nan", b"1e300", b"-inf", b"", b"imu", b"gps", b"\x00", b"99999999999999999999", b"x,y")
 
 
@@ -39,8 +41,8 @@ def csv_stream(seconds: float = 2.0) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def ulog_stream(seconds: float = 2.0) -> bytes:
-    """The same vehicle as a ULog."""
+def ulog_stream(seconds: float = 2.0, change: Callable[[Topics], None] | None = None) -> bytes:
+    """The same vehicle as a ULog; `change` may alter its topics."""
 
     def table(period: int, **fields: tuple[str, Any]) -> np.ndarray:
         stamps = np.arange(1_000_000, 1_000_000 + int(seconds * 1e6), period)
@@ -77,7 +79,33 @@ def ulog_stream(seconds: float = 2.0) -> bytes:
         "vehicle_air_data": table(40_000, baro_alt_meter=("f4", 500.0)),
         "vehicle_magnetometer": table(20_000, magnetometer_ga=("f4", [0.22, 0.0, 0.43])),
         "vehicle_land_detected": table(500_000, landed=("?", True), at_rest=("?", True)),
+        # what the filter on board knew, so that the replay starts from it
+        "estimator_states": table(
+            100_000,
+            timestamp_sample=("u8", 0),
+            states=("f4", [1.0, *[0.0] * 8, -500.0, *[0.0] * 6, 0.22, 0.0, 0.43, *[0.0] * 6]),
+            covariances=("f4", [1e-3] * 24),
+        ),
+        "estimator_status_flags": table(
+            100_000,
+            **{
+                f"cs_{name}": ("?", True) for name in ("tilt_align", "yaw_align", "baro_hgt", "mag")
+            },
+        ),
+        "estimator_baro_bias": table(100_000, bias=("f4", 0.0), bias_var=("f4", 0.1)),
+        "vehicle_attitude": table(50_000, q=("f4", [1.0, 0.0, 0.0, 0.0])),
+        "vehicle_local_position": table(
+            100_000,
+            **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), ("f4", 0.0)),
+            ref_lat=("f8", 47.4),
+            ref_lon=("f8", 8.5),
+            ref_alt=("f4", 500.0),
+        ),
     }
+    states = topics["estimator_states"]
+    states["timestamp_sample"] = states["timestamp"] + 50_000
+    if change is not None:
+        change(topics)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.ulg"
         write_ulog(path, topics, {"EKF2_GPS_DELAY": 110.0})
@@ -124,7 +152,7 @@ def outcome(data: bytes, path: Path) -> str:
     try:
         log = read_log(path)
         p = parameter_array(log, parameter_values(log))
-        replay = play(log.samples, p)
+        replay = play(log.samples, p, log.start)
         diagnosis(log, replay, p)
         summaries(replay)
         against_on_board(replay, log)

@@ -1,10 +1,12 @@
 """The fixed wing from 5 km to a standstill: closed loop, open loop, and the same bytes again."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from pydrake.systems.analysis import Simulator
 from scipy.stats import chi2
 
@@ -13,17 +15,22 @@ from diagrams.landing_without_gps import (
     LandingWithoutGpsDiagram,
     LandingWithoutGpsScenario,
 )
+from diagrams.loading import load_scenario
 from plants.fixed_wing import FixedWingConfig
 from plants.recorded_flight import FLIGHT_COLUMNS, RecordedFlightConfig, write_flight
-from runs.landing_without_gps import diagram_for, simulate_landing
+from plumbline.command_line import cli
+from runs.compiled_landing import fly_compiled
+from runs.landing_without_gps import simulate_landing
+from runs.report import CameraStrip, write_report
+from runs.run import laboratory
 from systems.configuration import StructureChangedError
 from systems.controllers.fixed_wing_reference_flight import reference_flight
 from systems.estimators.runway_improved_filter import RunwayImprovedFilterConfig
 from systems.signals.runway_measurement import PHASE_STATUS
 from systems.supervisors.runway_phases import Phase
 
-CLOSED = LandingWithoutGpsScenario(duration=300.0)
-IMPROVED = LandingWithoutGpsScenario(duration=300.0, filter=RunwayImprovedFilterConfig())
+CLOSED = LandingWithoutGpsScenario(time_limit=300.0)
+IMPROVED = LandingWithoutGpsScenario(time_limit=300.0, filter=RunwayImprovedFilterConfig())
 # from 1.5 km: a whole landing in a minute
 SHORT = FixedWingConfig(start=[0.0, -1500.0, -158.9])
 
@@ -51,11 +58,11 @@ def test_lands_from_5_km_and_stops_on_the_runway(landing, kind):
 
 def test_the_error_shrinks_towards_the_touchdown_point(landing):
     result = landing["thesis"]
-    assert abs(result["lateral_100"]) < 3.0
-    assert abs(result["longitudinal_100"]) < 60.0
+    assert abs(result["lateral_100"]) < 20.0  # three of its standard deviations
+    assert abs(result["longitudinal_100"]) < 120.0
     assert result["phase_2000"] == Phase.FINAL
     assert result["phase_300"] == Phase.FINAL_WITH_LASER
-    assert result["altitude_300"] == pytest.approx(32.7, abs=6.0)
+    assert result["altitude_300"] == pytest.approx(32.7, abs=12.0)
 
 
 def test_same_seed_same_numbers_whatever_ran_before(landing):
@@ -73,7 +80,7 @@ def test_same_seed_same_numbers_whatever_ran_before(landing):
 
 def test_a_cloned_context_flies_on_to_the_same_end():
     scenario = short(IMPROVED, seed=5)
-    landing = diagram_for(scenario)
+    landing = laboratory(scenario).landing
     simulator = Simulator(landing.diagram)
     simulator.AdvanceTo(20.0)
     clone = simulator.get_context().Clone()
@@ -114,10 +121,10 @@ def test_open_loop_with_recorded_sensors_uses_them(tmp_path):
     scenario = short(CLOSED, aircraft=RecordedFlightConfig(path=str(path)))
     result = simulate_landing(scenario, 1)
     assert result["vertical_150"] == pytest.approx(5.0, abs=1.0)
-    assert "laser" not in diagram_for(scenario).systems
+    assert "laser" not in laboratory(scenario).landing.systems
     other = short(CLOSED, aircraft=RecordedFlightConfig())
     with pytest.raises(StructureChangedError, match="other sensors"):
-        diagram_for(scenario).configure(other)
+        laboratory(scenario).landing.configure(other)
 
 
 def test_without_laser_the_final_stays_without_it():
@@ -127,22 +134,92 @@ def test_without_laser_the_final_stays_without_it():
 
 
 def test_a_short_start_of_the_default_scenario():
-    landing = diagram_for(CLOSED)
+    landing = laboratory(CLOSED).landing
     simulator = Simulator(landing.diagram)
     simulator.AdvanceTo(1.0 / 16.0)
     status = PHASE_STATUS(landing.diagram.GetOutputPort("phase").Eval(simulator.get_context()))
     assert status.phase == Phase.STANDBY
 
 
-@pytest.mark.slow
 def test_the_improved_filter_is_better_and_honest():
-    """Over common seeds: smaller errors at 100 m, and a NEES that is not above its band."""
-    seeds = range(16)
-    thesis = [simulate_landing(CLOSED, seed) for seed in seeds]
-    improved = [simulate_landing(IMPROVED, seed) for seed in seeds]
+    """Over common seeds: smaller errors at 100 m, and a NEES inside its band.
+
+    Compiled landings, which `test_compiled_landing` holds to the diagram.
+    """
+    honest = dataclasses.replace(
+        IMPROVED,
+        gps=dataclasses.replace(
+            IMPROVED.gps, reported_horizontal_accuracy=0.0, reported_speed_accuracy=0.0
+        ),
+    )
+    runs = 120
+    improved = [fly_compiled(honest, seed) for seed in range(runs)]
+    thesis = [fly_compiled(CLOSED, seed) for seed in range(30)]
     for axis in ("lateral_100", "longitudinal_100"):
         spread = [np.std([result[axis] for result in results]) for results in (improved, thesis)]
-        assert spread[0] < 0.7 * spread[1]
+        assert spread[0] < 0.3 * spread[1]
     nees = np.mean([result["nees_100"] for result in improved])
-    # the filter is conservative by design: a third below the mean of 5 is allowed
-    assert 2.0 < nees < chi2.ppf(0.999, 5 * 16) / 16
+    low, high = chi2.ppf([0.0005, 0.9995], 5 * runs) / runs
+    assert low < nees < high
+    assert np.mean([result["nees_100"] for result in thesis]) > 3.0 * high
+
+
+def test_the_scenario_of_the_laboratory_starts():
+    """A smoke run of the full procedure, recorded."""
+    lab = laboratory(dataclasses.replace(load_scenario("landing-without-gps"), time_limit=2.0))
+    simulator = lab.start()
+    result = lab.fly(simulator)
+    assert not result.landed
+    assert result.reason == "time limit in the air"
+    assert "time limit" in result.sentences()[0]
+    log = lab.log(simulator.get_context())
+    assert {"state.p_n_x", "estimate.covariance_x_x", "fix.p_n_x"} <= set(log.column_names)
+    assert lab.landing.state(simulator.get_context()) == "standby"
+
+
+def test_the_report_draws_what_the_thesis_draws(tmp_path):
+    lab = laboratory(short(IMPROVED))
+    simulator = lab.start()
+    strip = CameraStrip(lab.landing, 10.0)
+    result = lab.fly(simulator, strip)
+    assert result.landed
+    assert len(strip.frames) >= 4
+    path = tmp_path / "report.html"
+    write_report(path, lab.landing, result, lab.log(simulator.get_context()), strip.frames)
+    page = path.read_text()
+    for title in ("Ground track", "Profile", "Error across", "Innovation: laser", "Cameras"):
+        assert title in page
+    assert json.dumps(result.summary(), allow_nan=True)
+
+
+GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("camera.mounting=[0, 60, 0]", ("camera.mounting", "sees the touch-down point")),
+        ("camera.mounting=[180, 0, 0]", ("camera.mounting", "behind it")),
+        ("tracker.clicks=[50, 40, 30]", ("tracker.clicks", "loss_distance")),
+        ("terrain={kind: file, path: nowhere.asc}", ("nowhere.asc", "no such file")),
+        ("terrain={kind: file, path: short.asc}", ("short.asc", "expected 2 x 2 elevations")),
+        ("aircraft={kind: recorded_flight, path: nowhere.csv}", ("nowhere.csv", "CSV")),
+        ("aircraft={kind: recorded_flight, path: empty.csv}", ("empty.csv", "CSV")),
+        ("aircraft={kind: recorded_flight, path: torn.csv}", ("torn.csv", "column v_north")),
+        ("aircraft={kind: recorded_flight, start_distance: 1}", ("start_distance", "within 1 m")),
+        ("filter={kind: kalman}", ("filter", "error_filter")),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_ends_with_2(override, parts, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "short.asc").write_text(GRID)
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "torn.csv").write_text("time,north,east,down\n0,1,2,3\n")
+    arguments = ["land", "landing-without-gps-final", "--set", override, "--out", "out"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 2, result.output
+    sentence = result.output.strip()
+    assert sentence.startswith("plumbline: ")
+    assert "\n" not in sentence
+    for part in parts:
+        assert part in sentence

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from runs.log_sources import ReplayError, read_log
+from runs.replay import parameter_array, parameter_values, play
 from systems.signals import sensor_log as logs
 from tests.runs.damage import csv_stream, damaged, outcome, ulog_stream
 from tests.shared_data import shared
@@ -107,3 +108,37 @@ def test_reads_real_flights(name, rate, has_vision):
     assert log.parameters["EKF2_ACC_NOISE"] == pytest.approx(0.35)
     assert log.on_board is not None
     assert (logs.EXTERNAL_VISION in log.samples.kinds) == has_vision
+
+
+def test_start_on_board_is_read(tmp_path):
+    path = tmp_path / "log.ulg"
+    path.write_bytes(ULOG)
+    start = read_log(path).start
+    assert start.time == 1_050_000.0
+    np.testing.assert_allclose(start.place, [47.4, 8.5, 500.0])
+    np.testing.assert_allclose(start.origin, [47.4, 8.5, 500.0])
+    assert set(start.flags) == {"tilt_align", "yaw_align", "baro_hgt", "mag"}
+    np.testing.assert_allclose(start.biases[0], [0.0, 0.1])
+    assert np.isnan(start.biases[1:]).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 0.0, 1e4, 1e30])
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [
+        ("estimator_states", "states"),
+        ("estimator_states", "covariances"),
+        ("estimator_baro_bias", "bias_var"),
+        ("vehicle_local_position", "ref_lat"),
+        ("vehicle_local_position", "z"),
+    ],
+)
+def test_damaged_start_leaves_no_nan(tmp_path, topic, name, value):
+    def change(topics):
+        topics[topic][name] = value
+
+    path = tmp_path / "log.ulg"
+    path.write_bytes(ulog_stream(change=change))
+    log = read_log(path)
+    replay = play(log.samples, parameter_array(log, parameter_values(log)), log.start)
+    assert np.isfinite(replay.output[:, :16]).all()

@@ -11,7 +11,7 @@ from pydrake.systems.primitives import Sine
 
 from systems.configuration import StructureChangedError
 from systems.data_recorder import DataRecorder, DataRecorderConfig
-from systems.schedule import CLOCK_PERIOD, ESTIMATE_OFFSET
+from systems.schedule import CLOCK_PERIOD
 from systems.signals.measurement import SETPOINT
 from tests.system_contract import periodic_update
 
@@ -34,7 +34,7 @@ def test_topology():
     recorder = DataRecorder(DataRecorderConfig(), ports=PORTS)
     assert [recorder.get_input_port(i).size() for i in range(2)] == [2, SETPOINT.size]
     assert recorder.num_output_ports() == 0
-    assert periodic_update(recorder) == (CLOCK_PERIOD, ESTIMATE_OFFSET)
+    assert periodic_update(recorder) == (CLOCK_PERIOD, 0.0)
     assert recorder.columns[:4] == ["time", "wave.a", "wave.b", "setpoint.p_WB_x"]
 
 

@@ -111,6 +111,7 @@ def fuse_bias(x, bias, measurement, variance, noise_density, noise):
         x[bias + at.B_BIAS] += gain * innovation
         x[bias + at.B_VARIANCE] -= gain * x[bias + at.B_VARIANCE]
         _constrain_bias(x, bias)
+    x[bias + at.B_REPORTED] = x[bias + at.B_BIAS]
     signed = limit(sign(innovation) * ratio, -1.0, 1.0)
     x[bias + at.B_LPF] += x[bias + at.B_ALPHA] * (signed - x[bias + at.B_LPF])
     if innovation > 0.0:

@@ -13,7 +13,6 @@ from pydrake.systems.framework import (
     DiagramBuilder,
     DiscreteValues,
     LeafSystem,
-    State,
 )
 
 from systems.configuration import (
@@ -28,7 +27,7 @@ from systems.estimators.ekf2 import filter as kernels
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import messages, parameters
 from systems.estimators.ekf2.world_model import earth_field
-from systems.schedule import ESTIMATE_OFFSET, PLANT_PERIOD
+from systems.schedule import CLOCK_PERIOD, PLANT_PERIOD
 from systems.signals.measurement import (
     BAROMETER,
     EXTERNAL_VISION,
@@ -42,6 +41,7 @@ from systems.signals.measurement import (
 _OBSERVATION_DELAYS = tuple(
     f"EKF2_{sensor}_DELAY" for sensor in ("GPS", "BARO", "MAG", "RNG", "EV")
 )
+_CONNECTED = slice(at.CONNECTED, at.CONNECTED + 6)
 VEHICLE_STATUS_SIZE = 3  # at rest, in the air, in ground effect (0/1)
 
 
@@ -145,10 +145,14 @@ class Ekf2(LeafSystem):
     position, `p_WB` is relative to where the filter started or, with external vision,
     to W's origin; a jump of `p_WB` shows in the reset counters.
 
-    | event | period | offset | what happens |
-    |---|---|---|---|
-    | update | that of the IMU | half of it | the IMU sample moves the output predictor; when the
-    samples make up EKF2_PREDICT_US, a filter step takes the other messages too |
+    | event | when | what happens |
+    |---|---|---|
+    | initialize | at the start | the empty filter of the last `configure` |
+    | update | every `period` from 0 | the IMU sample moves the output predictor; a filter step
+    follows when the samples make up EKF2_PREDICT_US |
+
+    The other messages are looked at every 20 ms, on the tick after the one that sensors have
+    their events on.
 
     The discrete state has two groups: the filter's flat array (see `layout`) and `estimate`.
     """
@@ -157,14 +161,15 @@ class Ekf2(LeafSystem):
         super().__init__()
         sizes = (GNSS, BAROMETER, MAGNETOMETER, RANGE_FINDER, EXTERNAL_VISION)
         names = ("gnss", "barometer", "magnetometer", "range_finder", "external_vision")
-        self._imu = self.DeclareVectorInputPort("imu", INERTIAL.size)
-        ports = [
+        self._imu = self.DeclareVectorInputPort("imu", INERTIAL.size).Eval
+        self._ports = [
             self.DeclareVectorInputPort(name, layout.size)
             for name, layout in zip(names, sizes, strict=True)
         ]
-        ports.append(self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS_SIZE))
-        self._optional = [(port, at.CONNECTED + i) for i, port in enumerate(ports)]
+        self._ports.append(self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS_SIZE))
+        self._optional = [port.Eval for port in self._ports]
         self._absent = np.empty(0)
+        self._nothing = [self._absent] * len(self._ports)
 
         self._configure(config)
         self._filter = self.DeclareDiscreteState(self._initial)
@@ -184,8 +189,8 @@ class Ekf2(LeafSystem):
                 partial(self._calc, write),
                 prerequisites_of_calc={self.discrete_state_ticket(self._filter)},
             )
-        offset = config.period * (ESTIMATE_OFFSET / PLANT_PERIOD)
-        self.DeclarePeriodicDiscreteUpdateEvent(config.period, offset, self._update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
+        self._declare_update()
 
     def configure(self, config: Ekf2Config, seed: int = 0) -> None:
         """Take over another configuration for the next run.
@@ -207,16 +212,26 @@ class Ekf2(LeafSystem):
 
     def _configure(self, config: Ekf2Config) -> None:
         self._config = config
+        self._rate = 1.0 / config.period
+        # The laboratory's sensors have their events on this grid; what they measure is there a
+        # tick later. Those of a log have times of their own.
+        self._poll = round(CLOCK_PERIOD / PLANT_PERIOD) if config.period == PLANT_PERIOD else 1
         self._parameters = config.parameter_array()
         self._initial = kernels.initialise(self._parameters)
         latitude, longitude, altitude = config.origin
         self._origin = np.array([np.radians(latitude), np.radians(longitude), altitude])
         self._by_validity = config.timestamps == "validity"
 
-    def SetDefaultState(self, context: Context, state: State) -> None:
-        """Start the filter anew with the present parameters."""
-        super().SetDefaultState(context, state)
-        state.get_mutable_discrete_state(self._filter).set_value(self._initial)
+    def _declare_update(self) -> None:
+        self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
+
+    def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # Drake fixes the default state when a system is built (it never asks Python for it), so
+        # what `configure` made of it is put in here, unless the filter has already begun.
+        x = discrete_state.get_mutable_value(0)
+        if x[at.INITIALISED] == 0.0:
+            x[:] = self._initial
+            x[_CONNECTED] = [port.HasValue(context) for port in self._ports]
 
     def _calc(
         self, write: Callable[[np.ndarray, np.ndarray], None], context: Context, out: BasicVector
@@ -232,19 +247,14 @@ class Ekf2(LeafSystem):
         x = discrete_state.get_mutable_value(0)
         estimate = discrete_state.get_mutable_value(1)
         parameters, absent = self._parameters, self._absent
-        imu = self._imu.Eval(context)
-        if x[at.INITIALISED] == 0.0:
-            for port, connected in self._optional:
-                x[connected] = port.HasValue(context)
-        if not messages.next_sample_completes(x):
-            port, connected = self._optional[-1]
-            status = port.Eval(context) if x[connected] else absent
-            if not messages.receive_imu(x, parameters, self._origin, imu, status, estimate):
-                return
-        optional = [
-            port.Eval(context) if x[connected] else absent for port, connected in self._optional
-        ]
-        if messages.receive(x, parameters, self._by_validity, imu, *optional):
+        messages_in = self._nothing
+        if round(context.get_time() * self._rate) % self._poll == self._poll - 1:
+            connected = x[_CONNECTED].tolist()
+            messages_in = [
+                evaluate(context) if is_connected else absent
+                for evaluate, is_connected in zip(self._optional, connected, strict=True)
+            ]
+        imu = self._imu(context)
+        if messages.receive(x, parameters, self._by_validity, imu, *messages_in):
             kernels.update(x, parameters)
-        if x[at.INITIALISED]:
-            messages.write_step(x, parameters, self._origin, estimate)
+        messages.write_step(x, parameters, self._origin, estimate)

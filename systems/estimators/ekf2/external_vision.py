@@ -426,7 +426,7 @@ def _position_measurement(x, p, sample):
     vx, vy = x[n], x[n + 1]
     is_ned = x[sample + at.EV_P_FRAME] == at.FRAME_NED
     if is_ned and not x[at.YAW_ALIGN]:
-        px = math.nan
+        px = py = math.nan
         _activate_position_bias(x, False)
         _reset_position_bias(x)
     elif not is_ned and x[at.EV_YAW]:

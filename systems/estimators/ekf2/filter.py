@@ -38,6 +38,7 @@ from systems.estimators.ekf2.output_predictor import (
     correct_output,
     predict_lever_arm,
     predict_output,
+    remember_output,
 )
 from systems.estimators.ekf2.prediction import (
     inhibit_biases,
@@ -63,6 +64,7 @@ from systems.estimators.ekf2.unaided import (
     update_zero_gyro,
     update_zero_velocity,
 )
+from systems.estimators.ekf2.warm_start import take_over
 
 _ALIGNED = math.radians(3.0) ** 2  # rad2, tilt variance of an aligned filter
 _SENSOR_ALPHA = 0.01 / (0.01 + 0.09)  # low-pass of 0.09 s at the nominal filter step
@@ -98,12 +100,6 @@ def push_imu(x, p, imu):
     if down_sample(x, imu):
         push_down_sampled(x, p, imu[0])
     return x[at.IMU_UPDATED] != 0.0
-
-
-@kernel
-def next_imu_completes(x):
-    """Whether the next IMU sample is expected to complete a filter step."""
-    return x[at.DS_COUNT] + 1.0 >= x[at.DS_REQUIRED]
 
 
 @kernel
@@ -279,6 +275,13 @@ def update(x, p):
     if not _load_delayed_sample(x):
         return False
     _average_step(x, p)
+    if x[at.START_TIME] != 0.0:
+        remember_output(x)
+        if x[at.TIME_DELAYED] < x[at.START_TIME]:
+            return False
+        take_over(x, p)
+        x[at.FILTER_INITIALISED] = 1.0
+        return True
     if not x[at.FILTER_INITIALISED]:
         if not initialise_tilt(x):
             return False

@@ -265,7 +265,8 @@ AID_EV_HGT = AID + 12 * A_SIZE
 # Bias estimators.
 B_BIAS, B_VARIANCE, B_DENSITY, B_MAXIMUM, B_DT, B_ALPHA, B_LPF = 0, 1, 2, 3, 4, 5, 6
 B_SINCE_NEGATIVE, B_SINCE_POSITIVE, B_ACTIVE, B_WAS_ACTIVE = 7, 8, 9, 10
-B_SIZE = 11
+B_REPORTED = 11  # the bias when it was last fused, which is what PX4 logs
+B_SIZE = 12
 BIAS_BARO = _reserve(B_SIZE)
 BIAS_GNSS_HGT = _reserve(B_SIZE)
 BIAS_EV_HGT = _reserve(B_SIZE)
@@ -372,6 +373,14 @@ OUT_FILTER_DT = _reserve()  # s, mean
 ARRIVED = _reserve(6)  # s, time of arrival of the last message of each sensor
 CONNECTED = _reserve(6)  # which optional ports have a source, in their order
 STATUS_SENT = _reserve(4)  # at rest, in air, ground effect, and when
+
+# The state of another filter to start from, see `warm_start`; no time (0) means there is none.
+START_TIME = _reserve()
+START_NOMINAL = _reserve(NOMINAL_SIZE)
+START_PLACE = _reserve(3)  # latitude, longitude (rad), altitude (m)
+START_VARIANCES = _reserve(ERRORS)
+START_FLAGS = _reserve(FLAG_COUNT)
+START_BIASES = _reserve(2 * 5)  # bias and variance of each bias estimator, NaN where not known
 
 # Rings: a header each; the entries stand behind the fixed part, a time first.
 RING_DATA, RING_ENTRIES, RING_WIDTH, RING_HEAD, RING_TAIL, RING_EMPTY = 0, 1, 2, 3, 4, 5

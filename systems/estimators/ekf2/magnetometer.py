@@ -92,7 +92,7 @@ def stop_magnetometer(x, p):
 
 
 @kernel
-def _update_world_model(x, p):
+def update_world_model(x, p):
     """Read the world magnetic model; true if it differs from what was known."""
     declination, inclination = p[prm.WORLD_DECLINATION], p[prm.WORLD_INCLINATION]
     strength = p[prm.WORLD_STRENGTH]
@@ -125,7 +125,7 @@ def _look_at_world_model(x, p):
     if not new_origin and not due:
         return False
     x[at.T_WORLD_MODEL] = x[at.TIME_DELAYED]
-    return _update_world_model(x, p)
+    return update_world_model(x, p)
 
 
 @kernel

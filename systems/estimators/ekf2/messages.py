@@ -379,8 +379,7 @@ def write_status(x, out):
 def receive(x, p, by_validity, imu, gnss, barometer, magnetometer, ranging, vision, vehicle_status):
     """Take all messages that have arrived; true if a filter step is due.
 
-    Needed only on ticks that complete a filter step: what arrived earlier than this IMU
-    sample is taken as of the one before.
+    What arrived earlier than this IMU sample is taken as of the one before.
 
     Parameters
     ----------
@@ -405,24 +404,9 @@ def receive(x, p, by_validity, imu, gnss, barometer, magnetometer, ranging, visi
 
 
 @kernel
-def receive_imu(x, p, origin, imu, vehicle_status, estimate):
-    """Take IMU and status alone and move the estimate; true if a filter step is due."""
-    row = np.empty(24)
-    take_imu(x, p, row, imu)
-    _take_status(x, p, row, vehicle_status)
-    if x[at.INITIALISED]:
-        write_motion(x, p, origin, estimate)
-    return x[at.IMU_UPDATED] != 0.0
-
-
-@kernel
 def write_step(x, p, origin, out):
-    """Write `VEHICLE_ESTIMATE` after a filter step."""
+    """Write `VEHICLE_ESTIMATE` after a tick, once there was an IMU sample."""
+    if x[at.INITIALISED] == 0.0:
+        return
     write_resets(x, p, origin, out)
     write_motion(x, p, origin, out)
-
-
-@kernel
-def next_sample_completes(x):
-    """Whether the next IMU sample is expected to complete a filter step (or is the first one)."""
-    return x[at.INITIALISED] == 0.0 or kernels.next_imu_completes(x)

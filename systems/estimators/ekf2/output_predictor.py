@@ -227,6 +227,32 @@ def _correct_vertical(x, correction, reference_down):
 
 
 @kernel
+def remember_output(x):
+    """Store the output in the history."""
+    entry = push(x, at.RING_OUTPUT, x[at.OUT_TIME])
+    for i in range(1, 1 + at.OUTPUT_FIELDS):
+        x[entry + i] = x[at.OUT_TIME + i]
+    entry = push(x, at.RING_VERTICAL, x[at.OUT_VERTICAL])
+    for i in range(1, 1 + at.VERTICAL_FIELDS):
+        x[entry + i] = x[at.OUT_VERTICAL + i]
+
+
+@kernel
+def align_vertical_output(x):
+    """Lay the vertical history onto the filter's state, from its oldest entry on."""
+    ring = at.RING_VERTICAL
+    delayed = oldest(x, ring)
+    speed = x[at.VELOCITY + 2] - x[delayed + _SPEED]
+    integral = x[delayed + _INTEGRAL]
+    data, width = int(x[ring + at.RING_DATA]), int(x[ring + at.RING_WIDTH])
+    for k in range(int(x[ring + at.RING_ENTRIES])):
+        x[data + k * width + _SPEED] += speed
+        x[data + k * width + _INTEGRAL] -= integral
+    x[at.OUT_VERTICAL + _SPEED] += speed
+    x[at.OUT_VERTICAL + _INTEGRAL] -= integral
+
+
+@kernel
 def correct_output(x, p):
     """Store the output in the history and correct it by the filter's new state at the horizon."""
     horizon = x[at.TIME_DELAYED]
@@ -238,12 +264,7 @@ def correct_output(x, p):
         x[at.OUT_GYRO_BIAS + i] = x[at.GYRO_BIAS + i]
         x[at.OUT_ACCEL_BIAS + i] = x[at.ACCEL_BIAS + i]
 
-    entry = push(x, at.RING_OUTPUT, x[at.OUT_TIME])
-    for i in range(1, 1 + at.OUTPUT_FIELDS):
-        x[entry + i] = x[at.OUT_TIME + i]
-    entry = push(x, at.RING_VERTICAL, x[at.OUT_VERTICAL])
-    for i in range(1, 1 + at.VERTICAL_FIELDS):
-        x[entry + i] = x[at.OUT_VERTICAL + i]
+    remember_output(x)
     delayed = oldest(x, at.RING_OUTPUT)
     vertical = oldest(x, at.RING_VERTICAL)
 

@@ -25,7 +25,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 
-PERIOD, OFFSET = 0.016, 0.004  # s, of the estimators' events
+PERIOD, OFFSET = 0.02, 0.0  # s, of the estimators' events
 
 
 @dataclass
@@ -147,7 +147,7 @@ def port_names(system: System) -> tuple[list[str], list[str]]:
 
 
 class Scene(LeafSystem):
-    """Marker and infrared measurements 32 ms late, every 32 ms, of a pad at W's origin.
+    """Marker and infrared measurements 40 ms late, every 40 ms, of a pad at W's origin.
 
     The vehicle sways without tilting; both cameras sit at the body's origin, looking down.
     """

@@ -12,7 +12,6 @@ from systems.estimators.ekf2_selector import (
     Ekf2SelectorConfig,
     combined_test_ratio,
 )
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.measurement import SETPOINT, VEHICLE_ESTIMATE
 from systems.supervisors.svgs_motion_control import SvgsMotionControl
 from systems.supervisors.svgs_routine import COMMAND, HOLD, SvgsRoutineConfig
@@ -29,7 +28,7 @@ class Bench:
         self.ratios = np.array([0.1, 0.1, 0.1])
         self.faults = [False, False, False]
         self.resets = [0, 0, 0]
-        self.time = ESTIMATE_OFFSET
+        self.time = 0.0
 
     def run(self, events: int = 1) -> np.ndarray:
         for _ in range(events):
@@ -64,7 +63,7 @@ class Bench:
 def test_topology():
     selector = Ekf2Selector(Ekf2SelectorConfig())
     assert_matches_docstring(selector)
-    assert periodic_update(selector) == (SCORE_PERIOD, ESTIMATE_OFFSET)
+    assert periodic_update(selector) == (SCORE_PERIOD, 0.0)
     with pytest.raises(StructureChangedError):
         selector.configure(Ekf2SelectorConfig(instances=2))
 

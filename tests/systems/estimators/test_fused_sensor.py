@@ -99,7 +99,7 @@ def test_topology():
 
 def test_schedule_and_initial_state():
     system = FusedSensor(FusedSensorConfig())
-    assert periodic_update(system) == (0.016, 0.004)
+    assert periodic_update(system) == (0.02, 0.0)
     output = system.get_output_port(0).Eval(system.CreateDefaultContext())
     np.testing.assert_array_equal(output, no_measurement(TARGET_MEASUREMENT))
 
@@ -194,7 +194,7 @@ def test_value_is_taken_once_and_is_valid_while_fresh():
 
 
 def test_new_but_invalid_sample_is_no_value():
-    unseen = marker(0.016)
+    unseen = marker(0.02)
     unseen[3] = 0.0
     bench = front_end()
     poll(bench, 0, marker=marker(0.0))

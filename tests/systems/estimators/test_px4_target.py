@@ -32,7 +32,7 @@ def test_topology(system):
 
 @pytest.mark.parametrize("system", FILTERS, ids=lambda system: type(system).__name__)
 def test_schedule_and_initial_state(system):
-    assert periodic_update(system) == (0.016, 0.004)
+    assert periodic_update(system) == (0.02, 0.0)
     target = TARGET_ESTIMATE(system.get_output_port(0).Eval(system.CreateDefaultContext()))
     assert target.acquired == 0.0
     assert target.time_of_last_fusion == -1.0
@@ -120,7 +120,7 @@ def test_late_measurement_in_order_equals_the_batch_answer():
     """With one late measurement the projected correction is exactly the Kalman smoother's."""
     rng = np.random.default_rng(4)
     accelerations = rng.standard_normal(12)
-    dt, q = 0.016, 0.3
+    dt, q = 0.02, 0.3
     axis = np.empty((33, kernel.SNAPSHOT))
     kernel.start_vision_axis(axis, 0.0, 1.0, 0.5, np.array([0.5, 0.4, 1.0]))
     kernel.keep_snapshot(axis)

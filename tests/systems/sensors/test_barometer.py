@@ -37,7 +37,7 @@ def record(config: BarometerConfig, state, duration: float, seed: int = 1) -> np
 def test_topology():
     barometer = Barometer(BarometerConfig())
     assert_matches_docstring(barometer)
-    assert periodic_update(barometer) == (0.032, 0.0)
+    assert periodic_update(barometer) == (0.08, 0.0)
 
 
 def test_starts_with_no_measurement():
@@ -47,7 +47,7 @@ def test_starts_with_no_measurement():
 
 def test_header():
     out = record(BarometerConfig(), body(), 1.0)
-    np.testing.assert_allclose(out[:, 0], 0.032 * np.arange(len(out)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 0], 0.08 * np.arange(len(out)), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(out[:, 0], out[:, 1])
     np.testing.assert_array_equal(out[:, 2], np.arange(len(out)))
     assert out[:, 3].all()
@@ -81,12 +81,12 @@ def test_drift_is_a_gauss_markov_process():
     assert drift.std() == pytest.approx(2.0, rel=0.12)
     for lag in (1, 5, 10, 20):
         correlation = np.corrcoef(drift[lag:], drift[:-lag])[0, 1]
-        assert correlation == pytest.approx(math.exp(-0.032 * lag / 0.32), abs=0.1)
+        assert correlation == pytest.approx(math.exp(-0.08 * lag / 0.32), abs=0.1)
 
 
 def test_drift_starts_at_its_spread():
     config = BarometerConfig(noise=0.0, drift=2.0, ground_effect=0.0)
-    first = [record(config, body(), 0.032, seed)[0, ALTITUDE] - 20.0 for seed in range(100)]
+    first = [record(config, body(), 0.08, seed)[0, ALTITUDE] - 20.0 for seed in range(100)]
     assert np.std(first) == pytest.approx(2.0, rel=4.0 / math.sqrt(200))
 
 
@@ -99,7 +99,7 @@ def test_default_drift_changes_by_what_users_report_in_ten_minutes():
 def test_ground_effect():
     config = BarometerConfig(ground_effect=1.5, ground_effect_height=0.4, **QUIET)
     sinking = {
-        height: height + 10.0 - record(config, body(height), 0.05)[-1, ALTITUDE]
+        height: height + 10.0 - record(config, body(height), 0.1)[-1, ALTITUDE]
         for height in (0.0, 0.4, 4.0)
     }
     assert sinking[0.0] == pytest.approx(1.5)
@@ -111,7 +111,7 @@ def test_ground_effect():
 def test_no_ground_effect_while_the_ground_carries_the_vehicle():
     config = BarometerConfig(vehicle_mass=3.0, **QUIET)
     standing = body(0.0, contact_force=3.0 * 9.80665)
-    assert record(config, standing, 0.05)[-1, ALTITUDE] == pytest.approx(10.0, abs=1e-12)
+    assert record(config, standing, 0.1)[-1, ALTITUDE] == pytest.approx(10.0, abs=1e-12)
 
 
 def test_deterministic_by_seed():

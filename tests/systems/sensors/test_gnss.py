@@ -15,7 +15,7 @@ from tests.shared_data import shared
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.signals.playback import Bench
 
-LOG_PERIOD = 0.064  # s, every fix stays longer than that
+LOG_PERIOD = 0.08  # s, every fix stays longer than that
 LATITUDE = GNSS.index("latitude")
 VELOCITY = GNSS.slice("v_W")
 ORIGIN = [47.397742, 8.545594, 488.0]
@@ -54,7 +54,7 @@ def errors(duration: float, seed: int = 1, **figures) -> np.ndarray:
 def test_topology():
     gnss = Gnss(GnssConfig())
     assert_matches_docstring(gnss)
-    assert periodic_update(gnss) == (0.016, 0.0)
+    assert periodic_update(gnss) == (0.02, 0.0)
 
 
 def test_starts_with_no_measurement():
@@ -62,7 +62,7 @@ def test_starts_with_no_measurement():
     np.testing.assert_array_equal(run.advance_to(0.0).values()[0], no_measurement(GNSS))
 
 
-@pytest.mark.parametrize(("rate", "intervals"), [(5, {0.192, 0.208}), (10, {0.096, 0.112})])
+@pytest.mark.parametrize(("rate", "intervals"), [(5, {0.2}), (10, {0.1})])
 def test_clock(rate, intervals):
     out = record(GnssConfig(rate=rate), body(), 20.0)
     assert len(out) == 20 * rate
@@ -70,7 +70,7 @@ def test_clock(rate, intervals):
     np.testing.assert_array_equal(out[:, 0], out[:, 1])
     late = out[:, 0] - out[:, 2] / rate
     assert late.min() > -1e-9
-    assert late.max() < 0.016
+    assert late.max() < 0.02
     assert {round(interval, 6) for interval in np.diff(out[:, 0])} == intervals
 
 

@@ -9,7 +9,14 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from systems.schedule import CLOCK_PERIOD
 from systems.sensors.infrared_camera import FalseBeacon, InfraredCamera, InfraredCameraConfig
-from systems.signals.measurement import BODY_STATE, INFRARED, PAD_STATE, VALID, no_measurement
+from systems.signals.measurement import (
+    BODY_STATE,
+    INFRARED,
+    PAD_STATE,
+    TIME_OF_VALIDITY,
+    VALID,
+    no_measurement,
+)
 from systems.vision.infrared_blobs import pad_position_from_infrared
 from tests.system_contract import assert_matches_docstring, periodic_update
 
@@ -121,6 +128,15 @@ def test_false_beacons(fidelity):
     assert view.blob_0_y == pytest.approx(-1.0 / 4.95, abs=0.003)
     assert view.blob_0_x == pytest.approx(-0.5 / 4.95, abs=0.003)
     assert view.blob_2_area == 0.0
+
+
+@pytest.mark.parametrize("fidelity", FIDELITIES)
+def test_a_false_beacon_shines_in_its_time(fidelity):
+    lamp = FalseBeacon(position=[1.0, 0.5, 0.0], start_time=0.1, end_time=0.2)
+    config = InfraredCameraConfig(fidelity=fidelity, false_beacons=[lamp])
+    rows = measurements(config, body((0.0, 0.0, 5.0)), 0.3)
+    count, time = rows[:, INFRARED.index("count")], rows[:, TIME_OF_VALIDITY]
+    np.testing.assert_array_equal(count, np.where((time >= 0.1) & (time < 0.2), 2.0, 1.0))
 
 
 @pytest.mark.parametrize("quantised", [True, False])

@@ -30,7 +30,7 @@ def record(config: MagnetometerConfig, state, duration=0.1, seed: int = 1) -> np
 def test_topology():
     magnetometer = Magnetometer(MagnetometerConfig())
     assert_matches_docstring(magnetometer)
-    assert periodic_update(magnetometer) == (0.032, 0.0)
+    assert periodic_update(magnetometer) == (0.08, 0.0)
 
 
 def test_starts_with_no_measurement():
@@ -40,7 +40,7 @@ def test_starts_with_no_measurement():
 
 def test_header():
     out = record(MagnetometerConfig(), body(), 1.0)
-    np.testing.assert_allclose(out[:, 0], 0.032 * np.arange(len(out)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 0], 0.08 * np.arange(len(out)), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(out[:, 0], out[:, 1])
     np.testing.assert_array_equal(out[:, 2], np.arange(len(out)))
     assert out[:, 3].all()

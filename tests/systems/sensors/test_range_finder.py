@@ -46,7 +46,7 @@ def measured(config: RangeFinderConfig, state, **inputs) -> float:
 def test_topology():
     finder = RangeFinder(RangeFinderConfig())
     assert assert_matches_docstring(finder).optional == {"pad"}
-    assert periodic_update(finder) == (0.032, 0.0)
+    assert periodic_update(finder) == (0.04, 0.0)
 
 
 def test_starts_with_no_measurement():
@@ -56,7 +56,7 @@ def test_starts_with_no_measurement():
 
 def test_header():
     out = record(RangeFinderConfig(), body(), 1.0)
-    np.testing.assert_allclose(out[:, 0], 0.032 * np.arange(len(out)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 0], 0.04 * np.arange(len(out)), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(out[:, 0], out[:, 1])
     np.testing.assert_array_equal(out[:, 2], np.arange(len(out)))
     assert out[:, 3].all()

@@ -82,7 +82,7 @@ def test_laser_delay_bias_and_activation():
     quiet = {"bias_spread": 0.0, "noise": 0.0, "activation_spread": 0.0}
     out = arrivals(RunwayLaser(RunwayLaserConfig(**quiet)), {"state": state(up=80.0)}, 1.0)
     np.testing.assert_allclose(out[:, 4], 80.0)
-    np.testing.assert_allclose(out[:, 1] - out[:, 0], 0.2, atol=1e-9)
+    np.testing.assert_allclose(out[:, 1] - out[:, 0], 0.1, atol=1e-9)
     assert (out[:, 3] == 1.0).all()
     above = arrivals(RunwayLaser(RunwayLaserConfig(**quiet)), {"state": state(up=101.0)}, 1.0)
     assert (above[:, 3] == 0.0).all()

@@ -9,7 +9,6 @@ from pydrake.systems.framework import Context
 from scipy import stats
 
 from systems.configuration import StructureChangedError
-from systems.schedule import ESTIMATE_OFFSET
 from systems.signals.delay_line import (
     DelayLine,
     DelayLineConfig,
@@ -24,7 +23,7 @@ from systems.signals.noise import stream_key, uniform
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.signals.playback import Bench, Playback, samples
 
-PERIOD = 0.016  # s, of the sensor
+PERIOD = 0.02  # s, of the sensor
 
 
 def bench(config: DelayLineConfig, rows: np.ndarray, layout: Layout = BAROMETER, seed=1) -> Bench:
@@ -40,7 +39,7 @@ def released(config: DelayLineConfig, count: int = 40, seed: int = 1) -> np.ndar
 def test_topology():
     line = DelayLine(DelayLineConfig(), layout=BAROMETER)
     assert_matches_docstring(line)
-    assert periodic_update(line) == (0.008, 0.004)
+    assert periodic_update(line) == (0.01, 0.0)
 
 
 @pytest.mark.parametrize("layout", [Layout("Bare", ("a", "b", "c", "d")), BAROMETER, MARKER])
@@ -53,13 +52,13 @@ def test_holds_any_layout_and_starts_with_no_measurement(layout):
 
 
 def test_fixed_latency_is_exact_on_the_grid():
-    out = released(DelayLineConfig(latency=FixedLatency(time=0.052)))
+    out = released(DelayLineConfig(latency=FixedLatency(time=0.05)))
     assert len(out) == 40
-    np.testing.assert_allclose(out[:, 1], out[:, 0] + 0.052, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 1], out[:, 0] + 0.05, rtol=0, atol=1e-12)
 
 
 def test_latency_off_the_grid_ends_at_the_next_tick():
-    out = released(DelayLineConfig(latency=FixedLatency(time=0.0521)))
+    out = released(DelayLineConfig(latency=FixedLatency(time=0.0501)))
     np.testing.assert_allclose(out[:, 1], out[:, 0] + 0.060, rtol=0, atol=1e-12)
 
 
@@ -74,15 +73,15 @@ def test_exposure_processing_transport_and_draw_add():
 
 def test_latency_counts_from_the_time_of_validity():
     rows = samples(BAROMETER, PERIOD, 20)
-    rows[:, 0] -= 0.008  # waited a tick before the line saw it
-    out = bench(DelayLineConfig(processing=0.044), rows).advance_to(1.0).arrivals()
-    np.testing.assert_allclose(out[:, 1], rows[:, 0] + 0.044, rtol=0, atol=1e-12)
+    rows[:, 0] -= 0.01  # waited a tick before the line saw it
+    out = bench(DelayLineConfig(processing=0.04), rows).advance_to(1.0).arrivals()
+    np.testing.assert_allclose(out[:, 1], rows[:, 0] + 0.04, rtol=0, atol=1e-12)
 
 
 def test_a_release_is_visible_only_after_its_tick():
     run = bench(DelayLineConfig(processing=0.05), samples(BAROMETER, PERIOD, 1)).advance_to(0.1)
     seen = run.times()[run.values()[:, 1] >= 0.0]
-    assert seen[0] == pytest.approx(0.054, abs=1e-12)  # the log's first look after 0.052
+    assert seen[0] == pytest.approx(0.0525, abs=1e-12)  # the log's first look after 0.05
 
 
 @pytest.mark.parametrize(
@@ -114,8 +113,8 @@ def test_copies_have_latencies_of_their_own():
 
 
 def test_recorded_latencies_are_cycled():
-    out = released(DelayLineConfig(latency=RecordedLatency(times=[0.02, 0.036, 0.028])))
-    expected = np.resize([0.02, 0.036, 0.028], 40)
+    out = released(DelayLineConfig(latency=RecordedLatency(times=[0.02, 0.04, 0.03])))
+    expected = np.resize([0.02, 0.04, 0.03], 40)
     np.testing.assert_allclose(out[:, 1] - out[:, 0], expected, rtol=0, atol=1e-12)
 
 
@@ -127,7 +126,7 @@ def test_jitter_stays_in_its_bounds():
     latency = out[:, 1] - out[:, 0]
     assert len(out) == 400
     assert latency.min() >= 0.01
-    assert latency.max() < 0.06 + 2 * 0.008  # a tick late, and once more if two are due
+    assert latency.max() < 0.06 + 2 * 0.01  # a tick late, and once more if two are due
     assert np.std(latency) == pytest.approx(0.05 / math.sqrt(12), rel=0.1)
 
 
@@ -142,7 +141,7 @@ def test_drops_are_a_function_of_seed_and_number():
 def test_duplicates_come_twice_and_are_otherwise_alike():
     config = DelayLineConfig(duplicate=0.4, latency=FixedLatency(time=0.02))
     rows = samples(BAROMETER, PERIOD, 500)
-    run = bench(config, rows).advance_to(9.0)
+    run = bench(config, rows).advance_to(11.0)
     out = run.arrivals()
     number, copies = np.unique(out[:, 2], return_counts=True)
     np.testing.assert_array_equal(number, np.arange(500))
@@ -171,11 +170,11 @@ def test_order():
 
 
 def test_two_that_are_due_leave_at_two_ticks_the_older_one_first():
-    latency = RecordedLatency(times=[0.052, 0.036])  # both are due 52 ms after the first
+    latency = RecordedLatency(times=[0.06, 0.04])  # both are due 60 ms after the first
     for order in ("first_in_first_out", "by_release_time"):
         out = released(DelayLineConfig(latency=latency, order=order), 2)
         np.testing.assert_array_equal(out[:, 2], [0, 1])
-        np.testing.assert_allclose(out[:, 1], [0.052, 0.06], atol=1e-12)
+        np.testing.assert_allclose(out[:, 1], [0.06, 0.07], atol=1e-12)
 
 
 def test_overflow_loses_the_oldest_and_counts_it():
@@ -191,7 +190,7 @@ def reference(rows: np.ndarray, config: DelayLineConfig, keys, parameters, end: 
     queue: list[tuple[float, int, int]] = []
     out, entered, last, i = [], 0, -math.inf, 0
     for tick in range(round(end / config.period)):
-        time = ESTIMATE_OFFSET + tick * config.period
+        time = tick * config.period
         if time > end:
             break
         if i < len(rows) and rows[i, 1] < time:
@@ -255,7 +254,7 @@ def test_seeds_and_streams_differ():
 def test_configure():
     line = DelayLine(DelayLineConfig(), layout=BAROMETER)
     line.configure(DelayLineConfig(processing=0.05, latency=FixedLatency(time=0.1)), 3)
-    for changed in (DelayLineConfig(capacity=5), DelayLineConfig(period=0.016)):
+    for changed in (DelayLineConfig(capacity=5), DelayLineConfig(period=0.02)):
         with pytest.raises(StructureChangedError):
             line.configure(changed, 3)
 

@@ -38,7 +38,7 @@ from systems.signals.measurement import (
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.signals.playback import Bench, Playback, samples
 
-PERIOD = 0.016  # s, of the sensor
+PERIOD = 0.02  # s, of the sensor
 INFRARED_BIT, MARKER_BIT = 1, 2
 
 
@@ -89,7 +89,7 @@ def test_topology():
     injector = FaultInjector(FaultInjectorConfig(), layout=BAROMETER)
     contract = assert_matches_docstring(injector)
     assert contract.optional == {"body", "pad", "supervisor", "command"}
-    assert periodic_update(injector) == (0.008, 0.0)
+    assert periodic_update(injector) == (0.01, 0.0)
 
 
 def test_without_faults_everything_passes_a_tick_later():
@@ -98,7 +98,7 @@ def test_without_faults_everything_passes_a_tick_later():
     np.testing.assert_array_equal(run.values()[0], no_measurement(BAROMETER))
     out = run.arrivals()
     np.testing.assert_array_equal(np.delete(out, 1, axis=1), np.delete(rows, 1, axis=1))
-    np.testing.assert_allclose(out[:, 1], rows[:, 1] + 0.008, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 1], rows[:, 1] + 0.01, rtol=0, atol=1e-12)
 
 
 # Table 2 of the thesis: None, Random X, Permanent, Below X, Above X.
@@ -123,8 +123,8 @@ def test_below_and_above_are_complements_but_for_the_threshold():
     body = {"body": falling(6.0, 4.0)}  # 3 m at 0.75 s
     below = numbers(BelowDrop(height=3.0), count=100, body=falling(6.0, 4.0))
     above = numbers(AboveDrop(height=3.0), count=100, **body)
-    # The height counts that stood in the port just before the event, 8 ms after the sample.
-    height = 6.0 - 4.0 * (PERIOD * np.arange(100) + 0.008 - 0.002)
+    # The height counts that stood in the port just before the event, 10 ms after the sample.
+    height = 6.0 - 4.0 * (PERIOD * np.arange(100) + 0.01 - 0.002)
     assert below == list(np.flatnonzero(height > 3.0))
     assert above == list(np.flatnonzero(height < 3.0))
 
@@ -170,14 +170,14 @@ def test_frames_without_a_detection_do_not_advance_a_periodic_fault():
 
 def test_windows():
     kept = numbers(WindowsDrop(windows=[[0.1, 0.2], [0.4, 0.5]]), count=60)
-    at = PERIOD * np.arange(60) + 0.008
+    at = PERIOD * np.arange(60) + 0.01
     inside = ((at >= 0.1) & (at < 0.2)) | ((at >= 0.4) & (at < 0.5))
     assert kept == list(np.flatnonzero(~inside))
 
 
 def test_start_and_end_time():
     kept = numbers(PermanentDrop(start_time=0.2, end_time=0.4), count=60)
-    at = PERIOD * np.arange(60) + 0.008
+    at = PERIOD * np.arange(60) + 0.01
     assert kept == list(np.flatnonzero((at < 0.2) | (at >= 0.4)))
 
 
@@ -188,7 +188,7 @@ def test_below_three_metres_only_during_the_first_attempt():
     fault = BelowDrop(height=3.0, until_attempt=1)
     attempts = supervisor([0.0, 0.2, 0.4], [0, 1, 2])
     kept = numbers(fault, body=body, supervisor=attempts)
-    assert kept[0] == np.ceil((0.4 - 0.008) / PERIOD)
+    assert kept[0] == np.ceil((0.4 - 0.01) / PERIOD)
     assert kept == list(range(kept[0], 50))
 
 
@@ -199,9 +199,9 @@ def test_from_attempt_and_while_landing():
         assert passing == list(range(len(passing)))
         return len(passing)
 
-    # The first that is dropped came out of the port 8 ms after its sample, after the status.
-    assert kept(PermanentDrop(from_attempt=1)) == np.ceil((0.2 - 0.008 + 0.002) / PERIOD)
-    assert kept(PermanentDrop(while_landing=True)) == np.ceil((0.4 - 0.008 + 0.002) / PERIOD)
+    # The first that is dropped came out of the port 10 ms after its sample, after the status.
+    assert kept(PermanentDrop(from_attempt=1)) == np.ceil((0.2 - 0.01 + 0.002) / PERIOD)
+    assert kept(PermanentDrop(while_landing=True)) == np.ceil((0.4 - 0.01 + 0.002) / PERIOD)
 
 
 def test_attempts_need_the_supervisor():
@@ -232,7 +232,7 @@ def test_command_permanent(permanent):
 
 def test_command_periodic_starts_with_the_keep_phase():
     kept = commanded((0.2, 1, 0.0, 2, 3))
-    first = int(np.ceil((0.2 - 0.008 + 0.002) / PERIOD))  # the first one after the command
+    first = int(np.ceil((0.2 - 0.01 + 0.002) / PERIOD))  # the first one after the command
     assert kept == [n for n in range(60) if n < first or (n - first) % 5 < 2]
 
 
@@ -403,18 +403,18 @@ def test_between_a_sensor_and_its_delay_line_it_costs_no_time():
     barometer = BarometerConfig().add_to(builder, "barometer", 1)
     faults = FaultInjectorConfig(faults=[PeriodicDrop(keep=1, drop=1)])
     injector = faults.add_to(builder, "faults", 1, BAROMETER)
-    line = DelayLineConfig(processing=0.052).add_to(builder, "line", 1, BAROMETER)
+    line = DelayLineConfig(processing=0.05).add_to(builder, "line", 1, BAROMETER)
     body = builder.AddSystem(ConstantVectorSource(BODY_STATE.zeros()))
     builder.Connect(body.get_output_port(), barometer.get_input_port())
     builder.Connect(barometer.get_output_port(), injector.GetInputPort("measurement"))
     builder.Connect(injector.get_output_port(), line.get_input_port())
-    log = LogVectorOutput(line.get_output_port(), builder, 0.004)
+    log = LogVectorOutput(line.get_output_port(), builder, 0.005)
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(2.0)
     out = log.FindLog(simulator.get_context()).data().T
     out = out[np.flatnonzero(np.diff(out[:, 1], prepend=-1.0))]
     np.testing.assert_array_equal(out[:, 2], 2 * np.arange(len(out)))
-    np.testing.assert_allclose(out[:, 1] - out[:, 0], 0.052, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(out[:, 1] - out[:, 0], 0.05, rtol=0, atol=1e-12)
 
 
 def test_deterministic_by_seed():
@@ -441,7 +441,7 @@ def test_configure_changes_the_faults_but_not_the_period():
     run.system.configure(FaultInjectorConfig(faults=[PermanentDrop()]), 1)
     assert len(run.advance_to(0.3).arrivals()) == 0
     with pytest.raises(StructureChangedError):
-        run.system.configure(FaultInjectorConfig(period=0.016), 1)
+        run.system.configure(FaultInjectorConfig(period=0.02), 1)
 
 
 def test_too_many_faults():

@@ -20,7 +20,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import LogVectorOutput
 
-from systems.schedule import ESTIMATE_OFFSET, SUPERVISOR_PERIOD
+from systems.schedule import SUPERVISOR_PERIOD
 from systems.signals.measurement import (
     RANGE_FINDER,
     SETPOINT,
@@ -30,7 +30,7 @@ from systems.signals.measurement import (
 )
 from systems.supervisors.landing_supervisor import LandingSupervisor, LandingSupervisorConfig
 
-_PERIOD = 0.016  # s
+_PERIOD = 0.02  # s
 _POSITION_GAIN = 1.0  # 1/s
 _VELOCITY_GAIN = 3.0  # 1/s
 _SPEED_UP, _SPEED_DOWN = 3.0, 1.5  # m/s
@@ -84,7 +84,7 @@ class PointMass(LeafSystem):
         size = RANGE_FINDER.size
         self.DeclareVectorOutputPort("range_finder", size, self._range, {self.xd_ticket()})
         self.DeclareVectorOutputPort("rotor_commands", 6, self._rotors, {self.xd_ticket()})
-        self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, ESTIMATE_OFFSET, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
 
     def _offset(self, t: float) -> np.ndarray:
         if self.jump is None or t < self.jump[0]:
@@ -167,7 +167,7 @@ class Flight:
     Attributes
     ----------
     times : array of shape (n,)
-        s, every 32 ms.
+        s, every 40 ms.
     setpoints, status, estimates : named views of shape (n,) each
         By field name.
     states : list of str

@@ -39,13 +39,18 @@ def config(routine=None, **mission) -> LandingSupervisorConfig:
 def test_topology(routine):
     supervisor = LandingSupervisor(config(routine))
     assert_matches_docstring(supervisor)
-    assert periodic_update(supervisor) == (0.032, 0.0)
+    assert periodic_update(supervisor) == (0.04, 0.0)
 
 
 def test_memory_begins_with_the_layouts_of_the_outputs():
     fields = Memory.fields()
     assert len(fields) == len(set(fields))
-    renamed = [name.replace("setpoint_v", "v_WB_").replace("setpoint_", "p_WB_") for name in fields]
+    renamed = [
+        name.replace("setpoint_v", "v_WB_")
+        .replace("setpoint_a", "a_WB_")
+        .replace("setpoint_", "p_WB_")
+        for name in fields
+    ]
     renamed[6] = "yaw"
     assert tuple(renamed[: SETPOINT.size]) == SETPOINT.fields
     status = fields[SETPOINT.size : SETPOINT.size + SUPERVISOR_STATUS.size]
@@ -141,9 +146,9 @@ def test_waits_until_the_estimate_has_been_valid_for_a_while():
     for k in range(20):
         # Valid from the third event, with a gap at the fifth.
         valid = float(k >= 2 and k != 4)
-        setpoint, _ = event(supervisor, context, k * 0.032, estimate=estimate(valid=valid))
+        setpoint, _ = event(supervisor, context, k * 0.04, estimate=estimate(valid=valid))
         armed.append(setpoint.armed)
-    assert int(np.argmax(armed)) == 5 + math.ceil(0.1 / 0.032)
+    assert int(np.argmax(armed)) == 5 + math.ceil(0.1 / 0.04)
 
 
 def test_over_the_target_the_setpoint_puts_the_reference_point_on_it():
@@ -246,7 +251,7 @@ def test_jump_of_the_estimate_moves_every_stored_position():
         vertical_reset_counter=1.0,
         vertical_reset=2.0,
     )
-    for t in (50.0, 50.032):  # the second event sees the same counters
+    for t in (50.0, 50.04):  # the second event sees the same counters
         event(supervisor, context, t, estimate=jumped)
     fields = supervisor._routine.memory.fields()
     groups = [context.get_discrete_state(i).value() for i in range(3)]
@@ -264,7 +269,7 @@ def felt(detector, **changes):
     """Whether contact is felt in a situation of a vehicle on the ground that wants to descend."""
     memory = Memory()
     memory.armed, memory.setpoint_vz, memory.hover_command = 1.0, -0.5, 0.4
-    situation = Situation(memory, 0.032)
+    situation = Situation(memory, 0.04)
     situation.time, situation.height, situation.height_measured = 10.0, 0.2, True
     for name, value in changes.items():
         setattr(memory if hasattr(memory, name) else situation, name, value)
@@ -308,7 +313,7 @@ def test_touchdown_takes_longer_with_fewer_signs(changes, duration):
     detector = TouchdownDetector(TouchdownDetectorConfig())
     memory = Memory()
     memory.hover_command, memory.contact_since = 0.4, 10.0
-    situation = Situation(memory, 0.032)
+    situation = Situation(memory, 0.04)
     situation.height_measured = True
     for name, value in changes.items():
         setattr(situation, name, value)

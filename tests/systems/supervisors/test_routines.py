@@ -329,11 +329,11 @@ def test_px4_approach_setpoint_is_limited_in_speed_and_acceleration():
     speed = np.hypot(*v)
     assert speed.max() == pytest.approx(1.0, abs=0.01)
     # Speeding up is limited by the acceleration; slowing down by the distance left.
-    growth = np.diff(speed) / 0.032
+    growth = np.diff(speed) / 0.04
     assert growth.max() < 0.81
     # The setpoint moves as its velocity says.
     x = flown.setpoints.p_WB_x[approach]
-    np.testing.assert_allclose(np.diff(x), v[0][1:] * 0.032, atol=1e-9)
+    np.testing.assert_allclose(np.diff(x), v[0][1:] * 0.04, atol=1e-9)
 
 
 def test_px4_flies_on_to_the_last_known_point():

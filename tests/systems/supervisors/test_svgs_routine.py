@@ -8,7 +8,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from systems.configuration import StructureChangedError
-from systems.schedule import CLOCK_PERIOD, ESTIMATE_OFFSET, SUPERVISOR_PERIOD
+from systems.schedule import CLOCK_PERIOD, SUPERVISOR_PERIOD
 from systems.signals.measurement import SETPOINT, VEHICLE_ESTIMATE
 from systems.supervisors import svgs_routine as routine
 from systems.supervisors.landing_supervisor import LandingSupervisorConfig
@@ -70,6 +70,16 @@ FLIGHTS = {
     ),
     "lost for good": lambda: fly(
         8.0, plant={"visible": between(0.0, 12.0), "lost_time": 0.5}, short_height=5.0, **SHORT
+    ),
+    "lost twice": lambda: fly(
+        8.0,
+        plant={"visible": lambda t, z: t < 12.0 or 15.5 <= t < 23.0, "lost_time": 0.5},
+        short_height=2.0,
+        maximum_relocations=1,
+        **SHORT,
+    ),
+    "lost aligning, not to relocate": lambda: fly(
+        6.0, plant={"visible": outside(4.2, 9.0)}, maximum_relocations=0, **SHORT
     ),
     "lost low while aligning": lambda: fly(
         2.5, plant={"visible": between(0.0, 4.0), "lost_time": 0.5}, **SHORT
@@ -152,6 +162,13 @@ def test_lost_for_good_lands_at_the_last_known_place():
     flown = flight("lost for good")
     for state in ("relocate_xy", "relocate_xyz", "wait_for_sight", "scan", "land_without_sight"):
         assert state in flown.states
+    assert np.hypot(*(flown.position[:2] - PAD)) < 0.05
+
+
+def test_relocates_only_so_often():
+    flown = flight("lost twice")
+    assert flown.states.count("relocate_xy") == 1
+    assert flown.states[-3:] == ["descend", "land_without_sight", "landed"]
     assert np.hypot(*(flown.position[:2] - PAD)) < 0.05
 
 
@@ -310,8 +327,8 @@ def test_topology():
     for system in (commander, motion, px4, SvgsGuidance(config())):
         assert_matches_docstring(system)
     assert periodic_update(commander) == (SUPERVISOR_PERIOD, 0.0)
-    assert periodic_update(motion) == (SUPERVISOR_PERIOD, ESTIMATE_OFFSET)
-    assert periodic_update(px4) == (CLOCK_PERIOD, ESTIMATE_OFFSET)
+    assert periodic_update(motion) == (SUPERVISOR_PERIOD, 0.0)
+    assert periodic_update(px4) == (CLOCK_PERIOD, 0.0)
     for system, port, layout in (
         (commander, "command", COMMAND),
         (motion, "command", COMMAND),
@@ -341,9 +358,9 @@ def test_px4_control_sends_at_thirty_hertz():
     sent, mission, command = [], SETPOINT.zeros(), COMMAND.zeros()
     system.get_input_port(1).FixValue(context, np.full(SETPOINT.size, 7.0))
     system.get_input_port(2).FixValue(context, command)
-    for k in range(625):
+    for k in range(500):
         mission[0] = k
-        context.SetTime(k * CLOCK_PERIOD + ESTIMATE_OFFSET)
+        context.SetTime(k * CLOCK_PERIOD)
         system.get_input_port(0).FixValue(context, mission)
         values = system.AllocateDiscreteVariables()
         values.SetFrom(context.get_discrete_state())

@@ -114,12 +114,12 @@ def test_quaternion_of_mount(yaw):
     np.testing.assert_allclose(Rotation.from_quat(np.roll(q, -1)).as_matrix(), X[:, :3], atol=1e-12)
 
 
-@pytest.mark.parametrize("rate", [30.0, 50.0, 62.5, 7.0])
+@pytest.mark.parametrize("rate", [30.0, 45.0, 50.0, 7.0])
 def test_the_rate_is_kept_on_average(rate):
     ticks = CLOCK_PERIOD * np.arange(5_000)
     due = ticks[[is_due(t, rate) for t in ticks]]
     assert due[0] == 0.0
-    assert len(due) == pytest.approx(rate * 80.0, abs=1)
+    assert len(due) == pytest.approx(rate * 100.0, abs=1)
     # Each frame is the first tick at or after its nominal time.
     np.testing.assert_array_less(
         np.abs(due - np.arange(len(due)) / rate - CLOCK_PERIOD / 2), CLOCK_PERIOD / 2 + 1e-5

@@ -1,0 +1,459 @@
+"""The laboratory's own landing: down a cone that the estimate's own uncertainty narrows.
+
+The vehicle may be at a height h of its feet above the pad only where the place of the pad is
+known and close enough,
+
+    |e| + k σ ≤ ρ(h) = cone_radius + cone_slope h,
+
+e being the horizontal error and σ the target's standard deviation: inside it descends,
+outside it waits, far outside it climbs. Close to the pad it waits for a moment at which
+
+    |e + v τ| ≤ r,   r growing from touch_radius to touch_radius_limit while it waits,
+
+v the velocity relative to the pad, and then sits down at `touch_speed`.
+
+Disturbances are not left to the position controller's integrator. What accelerates the vehicle
+besides its rotors is observed and fed forward with the opposite sign (a disturbance observer;
+Ohnishi, Shibata, Murakami, "Motion control for advanced mechatronics", IEEE/ASME T-Mech 1(1),
+1996), and near the pad the position loop is stiffened,
+
+    d = a − g c/c_hover z_B,   d̂ ← low pass of d,   d₀ its mean as the landing begins
+    a_setpoint = d₀ − d̂ + position_gain e + velocity_gain (v_pad − v)
+    a_setpoint,z = sink_gain (v_setpoint,z − v_z)
+
+with c the mean rotor command behind the rotors' lag; d₀ is what the controller's integrator
+already holds against the steady wind. So in the last metre, seen or not, the wind is met by
+what it did a moment ago. The same d tells the ground: when the legs carry, d_z jumps. (It is
+not small before: wind and ground make the rotors lift more.) The rotors stop at once, because
+a vehicle that is light on its legs slides.
+
+A pad that moves is followed with its velocity, vertically too. When the target is lost the
+vehicle holds, goes round (climbs over the last known place, which counts an attempt),
+and searches along a spiral whose windings lie within the cameras' view. When attempts or time
+are used up it lands on the best it knows. Sensors are not switched by height: their
+covariances say which one counts.
+"""
+
+import math
+from typing import Literal
+
+from pydantic import Field
+
+from systems.configuration import Finite, Metres, NonNegative, Positive, Seconds, configuration
+from systems.schedule import PLANT_PERIOD
+from systems.supervisors.situation import Memory, Situation
+from systems.supervisors.state_machine import (
+    State,
+    Transition,
+    TransitionTable,
+    transitions_from,
+)
+
+_GRAVITY = 9.80665  # m/s2
+_NEAR, _FAR = 0.5, 1.0  # m, of error: the position loop is stiffened within, not beyond
+_VERTICAL_GAIN = 1.0  # 1/s, height error to speed
+_CLOSE = 0.12  # m, of the feet above the pad, within which a push from below is the ground
+_STILL = 0.15  # m/s, vertical speed that tells the ground where no height is known
+
+
+class ConeMemory(Memory):
+    """What the routine remembers besides."""
+
+    drift_ax: float = 0.0  # m/s2, low-passed disturbance
+    drift_ay: float = 0.0
+    held_ax: float = 0.0  # m/s2, what of it the controller's integrator holds
+    held_ay: float = 0.0
+    push: float = math.nan  # m/s2, low-passed vertical disturbance
+    thrust: float = math.nan  # 1, rotor command by that of level flight, behind the rotors' lag
+    known: float = 0.0  # 0/1, the pad has been seen
+    pad_x: float = math.nan  # m, the pad as last known, carried on with its velocity
+    pad_y: float = math.nan
+    pad_z: float = math.nan
+    pad_ux: float = 0.0  # m/s
+    pad_uy: float = 0.0
+    pad_uz: float = 0.0
+    turn: float = 0.0  # rad, along the spiral
+    centre_x: float = 0.0  # m, of the spiral
+    centre_y: float = 0.0
+    level_z: float = 0.0  # m, to climb to
+
+
+S = Situation[ConeMemory]
+
+_WATCH = ("observe_drift", "track_pad")
+
+
+class Cone:
+    """Guards and actions of the landing down a cone."""
+
+    table = TransitionTable(
+        initial="look",
+        states=(
+            State("look", entry=("hold_position",), stay=_WATCH),
+            State("descend", stay=(*_WATCH, "follow", "descend_in_cone")),
+            State("settle", stay=(*_WATCH, "follow", "keep_low")),
+            State("touch", stay=(*_WATCH, "follow", "sit_down")),
+            State("hold", stay=(*_WATCH, "follow", "rise_for_view")),
+            State("go_round", entry=("begin_attempt",), stay=(*_WATCH, "follow", "climb")),
+            State("search", entry=("begin_search",), stay=(*_WATCH, "fly_spiral")),
+            State("land_anyway", stay=(*_WATCH, "follow_or_return", "sit_down_there")),
+        ),
+        transitions=(
+            *transitions_from(
+                ("descend", "settle", "touch", "land_anyway"), "landed", "on_the_ground"
+            ),
+            *transitions_from(
+                ("descend", "settle", "touch", "land_anyway"), "landed", "touched_down"
+            ),
+            *transitions_from(
+                ("look", "descend", "settle", "hold", "go_round", "search"),
+                "land_anyway",
+                "time_is_up",
+            ),
+            Transition("look", "descend", "target_acquired"),
+            Transition("look", "search", "looked_in_vain"),
+            Transition("descend", "hold", "target_lost"),
+            Transition("descend", "settle", "close_above_pad"),
+            Transition("settle", "hold", "target_lost"),
+            Transition("settle", "touch", "aligned"),
+            Transition("settle", "descend", "blown_away"),
+            Transition("touch", "descend", "missing_pad"),
+            Transition("hold", "descend", "target_acquired"),
+            Transition("hold", "go_round", "held_and_attempts_left"),
+            Transition("hold", "land_anyway", "held_long_enough"),
+            Transition("go_round", "descend", "high_enough_and_acquired"),
+            Transition("go_round", "search", "high_enough"),
+            Transition("search", "descend", "target_acquired"),
+            Transition("search", "land_anyway", "searched_everywhere"),
+        ),
+    )
+    memory = ConeMemory
+
+    def __init__(self, config: "ConeConfig"):
+        """A landing down a cone; see `ConeConfig`."""
+        self.config = config
+
+    # -- what is known
+
+    def _feet(self, s: S) -> float:
+        """The height of the feet above the pad, m."""
+        return s.z - s.memory.pad_z + self.config.feet_height
+
+    def _goal(self, s: S) -> tuple[float, float]:
+        """Where the body must be so that it stands over the pad after it has come down level.
+
+        It leans into the wind by −d̂/g, and will fall back on its feet.
+        """
+        m, share = s.memory, self.config.feet_height / _GRAVITY
+        return m.pad_x + share * m.drift_ax, m.pad_y + share * m.drift_ay
+
+    def _error(self, s: S) -> tuple[float, float]:
+        x, y = self._goal(s)
+        return x - s.x, y - s.y
+
+    def _distance(self, s: S) -> float:
+        return math.hypot(*self._error(s))
+
+    def _radius(self, s: S) -> float:
+        return self.config.cone_radius + self.config.cone_slope * max(self._feet(s), 0.0)
+
+    def _spread(self, s: S) -> float:
+        """|e| + k σ, m."""
+        return self._distance(s) + self.config.sigmas * s.goal_sigma
+
+    def _predicted(self, s: S) -> float:
+        """|e + v τ|, m."""
+        m, lead = s.memory, self.config.touch_lead
+        ex, ey = self._error(s)
+        return math.hypot(ex + (m.pad_ux - s.vx) * lead, ey + (m.pad_uy - s.vy) * lead)
+
+    # -- guards
+
+    def target_acquired(self, s: S) -> bool:
+        """The target is acquired."""
+        return s.acquired
+
+    def target_lost(self, s: S) -> bool:
+        """The target is not acquired any more."""
+        return not s.acquired
+
+    def looked_in_vain(self, s: S) -> bool:
+        """The target is not seen from here."""
+        return s.time - s.memory.entered >= self.config.look_time
+
+    def close_above_pad(self, s: S) -> bool:
+        """The feet are so low that only sitting down is left."""
+        return self._feet(s) <= self.config.settle_height + 0.05
+
+    def aligned(self, s: S) -> bool:
+        """The pad will be met where it should be."""
+        c = self.config
+        share = min((s.time - s.memory.entered) / c.patience, 1.0)
+        allowed = c.touch_radius + (c.touch_radius_limit - c.touch_radius) * share * share
+        low = self._feet(s) <= c.settle_height + 0.08
+        return low and self._predicted(s) + s.goal_sigma <= allowed
+
+    def blown_away(self, s: S) -> bool:
+        """The vehicle has left the cone."""
+        return self._spread(s) > 2.0 * self._radius(s)
+
+    def missing_pad(self, s: S) -> bool:
+        """The feet would come down too far from where they should, and there is still room."""
+        c = self.config
+        return self._feet(s) > _CLOSE / 2 and self._distance(s) > 1.5 * c.touch_radius_limit
+
+    def on_the_ground(self, s: S) -> bool:
+        """The legs carry."""
+        if s.memory.setpoint_vz - s.memory.pad_uz >= 0.0 or not math.isnan(s.memory.setpoint_z):
+            return False
+        jump = self._push(s) - s.memory.push
+        if not jump >= self.config.contact_push:
+            return False
+        if s.memory.known > 0.0:
+            return self._feet(s) < _CLOSE
+        if s.height_measured:
+            return s.height + self.config.feet_height < _CLOSE
+        return abs(s.vz) < _STILL
+
+    def time_is_up(self, s: S) -> bool:
+        """The landing has taken as long as it may."""
+        return s.time - s.memory.landing_started >= self.config.maximum_time
+
+    def held_long_enough(self, s: S) -> bool:
+        """The target has not come back."""
+        return s.time - s.memory.entered >= self.config.hold_time
+
+    def held_and_attempts_left(self, s: S) -> bool:
+        """The target has not come back, and another attempt is left."""
+        return self.held_long_enough(s) and s.memory.attempts < self.config.maximum_attempts
+
+    def high_enough(self, s: S) -> bool:
+        """The height to start again from is reached."""
+        return s.z >= s.memory.level_z - self.config.tolerance
+
+    def high_enough_and_acquired(self, s: S) -> bool:
+        """The height to start again from is reached, and the target is seen."""
+        return s.acquired and self.high_enough(s)
+
+    def searched_everywhere(self, s: S) -> bool:
+        """The spiral has reached its largest radius."""
+        return self._spiral_radius(s) >= self.config.search_radius
+
+    # -- actions
+
+    def _lagged_command(self, s: S) -> float:
+        """The rotor command by that of level flight, behind the rotors' lag; NaN if unknown."""
+        m = s.memory
+        if math.isnan(s.command) or m.hover_command <= 0.0:
+            return math.nan
+        command = s.command / m.hover_command
+        if math.isnan(m.thrust):
+            return command
+        return m.thrust + (command - m.thrust) * (1.0 - math.exp(-s.period / self.config.rotor_lag))
+
+    def _thrust(self, s: S) -> float:
+        """What the rotors' thrust accelerates, along the body's axis, m/s2."""
+        lagged = self._lagged_command(s)
+        return _GRAVITY * (1.0 / s.up_z if math.isnan(lagged) else lagged)
+
+    def _push(self, s: S) -> float:
+        """What accelerates the vehicle upwards besides its rotors, m/s2."""
+        return s.az + _GRAVITY - self._thrust(s) * s.up_z
+
+    def observe_drift(self, s: S) -> None:
+        """Observe what accelerates the vehicle besides its rotors."""
+        m, c = s.memory, self.config
+        thrust = self._thrust(s)
+        push = self._push(s)
+        if math.isnan(m.push):
+            m.push = push
+        m.push += (push - m.push) * (1.0 - math.exp(-s.period / c.push_time))
+        m.thrust = self._lagged_command(s)
+        drift_x, drift_y = s.ax - thrust * s.up_x, s.ay - thrust * s.up_y
+        age = s.time - m.landing_started
+        if age < s.period:
+            m.drift_ax, m.drift_ay = drift_x, drift_y
+            m.held_ax, m.held_ay = drift_x, drift_y
+        gain = 1.0 - math.exp(-s.period / c.drift_time)
+        m.drift_ax += gain * (drift_x - m.drift_ax)
+        m.drift_ay += gain * (drift_y - m.drift_ay)
+        m.setpoint_ax = m.setpoint_ay = m.setpoint_az = 0.0
+        if age < c.learning_time:  # a mean
+            share = s.period / (age + s.period)
+            m.held_ax += share * (drift_x - m.held_ax)
+            m.held_ay += share * (drift_y - m.held_ay)
+        else:
+            m.setpoint_ax, m.setpoint_ay = m.held_ax - m.drift_ax, m.held_ay - m.drift_ay
+
+    def track_pad(self, s: S) -> None:
+        """Remember where the pad is and how it moves; carry it on while it is not seen."""
+        m = s.memory
+        if s.acquired:
+            m.known = 1.0
+            m.pad_x, m.pad_y, m.pad_z = s.goal_x, s.goal_y, s.goal_z
+            m.pad_ux, m.pad_uy, m.pad_uz = s.pad_vx, s.pad_vy, s.pad_vz
+        elif m.known > 0.0:
+            if math.hypot(m.pad_ux, m.pad_uy) < self.config.moving_speed:
+                m.pad_ux = m.pad_uy = 0.0  # what it seemed to move was the estimate's noise
+            m.pad_x += m.pad_ux * s.period
+            m.pad_y += m.pad_uy * s.period
+            m.pad_uz = 0.0
+        elif not math.isnan(m.goal_x):  # seen before the landing began
+            m.known = 1.0
+            m.pad_x, m.pad_y, m.pad_z = m.goal_x, m.goal_y, m.goal_z
+
+    def follow(self, s: S) -> None:
+        """Go over the pad and with it."""
+        m, c = s.memory, self.config
+        # The goal is where the pad was a tick ago, and the setpoint stands for one period.
+        lead = PLANT_PERIOD + 0.5 * s.period
+        x, y = self._goal(s)
+        s.go_to(x + m.pad_ux * lead, y + m.pad_uy * lead, c.approach_speed)
+        m.setpoint_vx, m.setpoint_vy = m.pad_ux, m.pad_uy
+        m.target_in_use = 1.0 if s.acquired else 0.0
+        ex, ey = self._error(s)
+        share = min(max((_FAR - math.hypot(ex, ey)) / (_FAR - _NEAR), 0.0), 1.0)
+        m.setpoint_ax += share * (c.position_gain * ex + c.velocity_gain * (m.pad_ux - s.vx))
+        m.setpoint_ay += share * (c.position_gain * ey + c.velocity_gain * (m.pad_uy - s.vy))
+
+    def follow_or_return(self, s: S) -> None:
+        """Go over the pad if it has ever been seen, else to where the climb ended."""
+        m = s.memory
+        if m.known > 0.0:
+            self.follow(s)
+        else:
+            s.go_to(m.mark_x, m.mark_y, self.config.approach_speed)
+            m.target_in_use = 0.0
+
+    def _sink(self, s: S, rate: float) -> None:
+        m, c = s.memory, self.config
+        s.descend_with(rate - m.pad_uz)
+        push = c.sink_gain * (m.setpoint_vz - s.vz)
+        m.setpoint_az = min(max(push, -c.sink_push), c.sink_push)
+
+    def descend_in_cone(self, s: S) -> None:
+        """Descend inside the cone, wait outside, climb far outside."""
+        c = self.config
+        height = self._feet(s)
+        inside = (self._radius(s) - self._spread(s)) / (0.3 * self._radius(s))
+        fastest = min(c.descent_speed, _VERTICAL_GAIN * max(height - c.settle_height, 0.0) + 0.05)
+        self._sink(s, min(max(inside, -0.3), 1.0) * fastest)
+
+    def keep_low(self, s: S) -> None:
+        """Stay with the feet just above the pad."""
+        self._sink(s, _VERTICAL_GAIN * (self._feet(s) - self.config.settle_height))
+
+    def sit_down(self, s: S) -> None:
+        """Sink to the pad or the ground."""
+        c, m = self.config, s.memory
+        height = self._feet(s) if m.known > 0.0 else s.height + c.feet_height
+        self._sink(s, c.touch_speed + 0.3 * min(max(height - 1.0, 0.0), 3.0))
+
+    def sit_down_there(self, s: S) -> None:
+        """Sink where the pad should be, or anywhere if that takes too long."""
+        m, c = s.memory, self.config
+        late = s.time - m.landing_started >= c.maximum_time + c.return_time
+        if late or s.distance_to(m.setpoint_x, m.setpoint_y) < _FAR:
+            self.sit_down(s)
+        else:
+            self._sink(s, 0.0)
+
+    def hold_position(self, s: S) -> None:
+        """Stay over the point last asked for, at the present height."""
+        s.hold_horizontally()
+        s.hold_height()
+
+    def rise_for_view(self, s: S) -> None:
+        """Stay at the present height, or rise to where the cameras see more of the pad."""
+        wanted = self.config.view_height - self._feet(s)
+        self._sink(s, -min(max(_VERTICAL_GAIN * wanted, 0.0), 0.5))
+
+    def begin_attempt(self, s: S) -> None:
+        """Count another attempt and choose the height to start it from."""
+        m, c = s.memory, self.config
+        m.attempts += 1.0
+        m.level_z = max(m.pad_z + c.retry_height, s.z + 1.0)
+
+    def climb(self, s: S) -> None:
+        """Climb to the height of another attempt."""
+        s.climb_towards(s.memory.level_z, self.config.climb_speed)
+
+    def begin_search(self, s: S) -> None:
+        """Begin a spiral around the place where the pad should be."""
+        m = s.memory
+        m.turn = 0.0
+        known = m.known > 0.0
+        m.centre_x, m.centre_y = (m.pad_x, m.pad_y) if known else (m.setpoint_x, m.setpoint_y)
+        s.hold_height()
+        m.target_in_use = 0.0
+
+    def _pitch(self, s: S) -> float:
+        """The distance of the spiral's windings: what the cameras see across, with overlap, m."""
+        return max(2.0 * self.config.view * s.height * 0.7, 0.5)
+
+    def _spiral_radius(self, s: S) -> float:
+        return self._pitch(s) * s.memory.turn / (2.0 * math.pi)
+
+    def fly_spiral(self, s: S) -> None:
+        """Fly along an Archimedean spiral at constant speed."""
+        m, c = s.memory, self.config
+        pitch = self._pitch(s)
+        along = math.hypot(self._spiral_radius(s), pitch / (2.0 * math.pi))
+        m.turn += c.search_speed * s.period / along
+        radius = self._spiral_radius(s)
+        s.go_to(
+            m.centre_x + radius * math.cos(m.turn),
+            m.centre_y + radius * math.sin(m.turn),
+            c.approach_speed,
+        )
+        m.setpoint_vx = -c.search_speed * math.sin(m.turn)
+        m.setpoint_vy = c.search_speed * math.cos(m.turn)
+
+
+@configuration
+class ConeConfig:
+    """A landing down a cone; the figures are the laboratory's own unless a source is named."""
+
+    kind: Literal["cone"] = "cone"
+    feet_height: Finite = -0.2  # m, of the feet in B
+    # The cone
+    cone_radius: Positive = 0.12  # m, at the pad
+    cone_slope: NonNegative = 0.25  # 1
+    sigmas: NonNegative = 2.0  # 1, k
+    descent_speed: Positive = 1.2  # m/s
+    approach_speed: Positive = 5.0  # m/s, horizontal limit, ArduPilot's WPNAV_SPEED
+    # The last step
+    settle_height: Metres = 0.15  # m, of the feet above the pad
+    touch_radius: Positive = 0.03  # m
+    touch_radius_limit: Positive = 0.10  # m
+    patience: Positive = 15.0  # s, over which the radius grows
+    touch_lead: Seconds = 0.3  # s, τ
+    touch_speed: Positive = 0.4  # m/s
+    contact_push: Positive = 2.5  # m/s2, a jump that no vertical gust makes
+    push_time: Positive = 0.3  # s, low pass of what it jumps from
+    # The wind
+    drift_time: Positive = 0.15  # s, low pass of the disturbance
+    learning_time: Seconds = 1.0  # s, at the beginning, of the mean d₀
+    rotor_lag: Positive = 0.055  # s, of the rotors' thrust behind their command
+    position_gain: NonNegative = 1.5  # 1/s2
+    velocity_gain: NonNegative = 1.0  # 1/s
+    sink_gain: NonNegative = 2.5  # 1/s
+    sink_push: Positive = 2.0  # m/s2, at most
+    # Losses
+    moving_speed: NonNegative = 0.5  # m/s, slower than this an unseen pad is taken to rest
+    look_time: Seconds = 3.0  # s, before a search begins
+    hold_time: Seconds = 2.0  # s, before going round
+    retry_height: Metres = 5.0  # m above the pad; the marker is seen to 6 m and more
+    climb_speed: Positive = 1.5  # m/s
+    tolerance: Positive = 0.3  # m
+    view_height: Metres = 1.2  # m, of the feet above the pad, to which it rises when it loses sight
+    view: Positive = 0.3  # 1, tangent of half the narrower field of view: IR-LOCK's 100 x 3 mrad
+    search_speed: Positive = 1.5  # m/s
+    search_radius: Metres = 12.0  # m
+    maximum_attempts: int = Field(default=5, ge=1)
+    maximum_time: Positive = 120.0  # s, from the beginning of the landing
+    return_time: Seconds = 20.0  # s more, to fly to where it lands anyway
+
+    def routine(self) -> Cone:
+        """The routine with this configuration."""
+        return Cone(self)

@@ -1,0 +1,532 @@
+"""The multi-hypothesis estimator: late data, consistency, false beacons, moving pads."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from systems.estimators import multi_hypothesis_target_filter as track_filter
+from systems.estimators.fused_sensor import no_target
+from systems.estimators.multi_hypothesis_target import (
+    MultiHypothesisTarget,
+    MultiHypothesisTargetConfig,
+    TargetSensorsConfig,
+)
+from systems.estimators.multi_hypothesis_target_kernel import TARGET_HYPOTHESES
+from systems.signals.measurement import (
+    INFRARED,
+    MARKER,
+    RANGE_FINDER,
+    TARGET_ESTIMATE,
+    VEHICLE_ESTIMATE,
+    no_measurement,
+)
+from tests.system_contract import assert_matches_docstring, periodic_update
+from tests.systems.estimators.target_cases import (
+    OFFSET,
+    PERIOD,
+    Bench,
+    Scene,
+    Sway,
+    field,
+    horizontal_error,
+    port_names,
+    simulate,
+)
+
+NOISE = np.array([1e-3, 0.04, 0.09, 0.01, 30.0])  # as the filter takes them
+
+
+def config(mode="fused", **fields):
+    origin = [0.0, 0.0, 0.0]
+    sensors = TargetSensorsConfig(mode=mode, infrared_position=origin, marker_position=origin)
+    return MultiHypothesisTargetConfig(front_end=sensors, **fields)
+
+
+def test_topology():
+    system = MultiHypothesisTarget(config())
+    assert_matches_docstring(system)
+    inputs, outputs = port_names(system)
+    assert inputs == ["infrared", "marker", "range_finder", "estimate"]
+    assert outputs[:2] == ["target", "measurement"]
+    assert periodic_update(system) == (PERIOD, OFFSET)
+
+
+def test_initial_outputs():
+    system = MultiHypothesisTarget(config())
+    context = system.CreateDefaultContext()
+    values = [system.get_output_port(i).Eval(context) for i in range(3)]
+    np.testing.assert_array_equal(values[0], no_target())
+    assert values[1][3] == 0.0
+    assert not values[2].any()
+
+
+# -- the filter against plain matrices
+
+
+class Reference:
+    """The Kalman filter of the docstring, written once more with matrices."""
+
+    def __init__(self, x, P, time, noise):
+        self.x, self.P, self.time, self.noise = x.copy(), P.copy(), time, noise
+
+    def predict(self, time):
+        dt, self.time = time - self.time, time
+        density, horizontal, vertical, sigma, tau = self.noise
+        q = np.diag([horizontal, horizontal, vertical])
+        decay = np.exp(-dt / tau)
+        F = np.eye(8)
+        F[:3, 3:6] = dt * np.eye(3)
+        F[6:, 6:] = decay * np.eye(2)
+        Q = np.zeros((8, 8))
+        Q[:3, :3] = dt**3 / 3 * q + dt * density * np.eye(3)
+        Q[:3, 3:6] = Q[3:6, :3] = dt**2 / 2 * q
+        Q[3:6, 3:6] = dt * q
+        Q[6:, 6:] = sigma**2 * (1 - decay**2) * np.eye(2)
+        self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
+
+    def fuse(self, H, z, R):
+        S = H @ self.P @ H.T + R
+        K = self.P @ H.T @ np.linalg.inv(S)
+        innovation = z - H @ self.x
+        self.x = self.x + K @ innovation
+        self.P = (np.eye(8) - K @ H) @ self.P
+        return innovation @ np.linalg.solve(S, innovation)
+
+
+def random_measurements(rng, count, duration):
+    """Times, matrices, values and covariances of `count` measurements of one to three rows."""
+    times = np.sort(rng.uniform(0.0, duration, count))
+    measurements = []
+    for time in times:
+        rows = int(rng.integers(1, 4))
+        H5 = rng.standard_normal((rows, 5))
+        A = 0.1 * rng.standard_normal((rows, rows))
+        R = A @ A.T + 0.01 * np.eye(rows)
+        measurements.append((time, H5, rng.standard_normal(rows), R))
+    return measurements
+
+
+def full(H5):
+    """Rows over (p, b) as rows over the state."""
+    H = np.zeros((len(H5), 8))
+    H[:, :3], H[:, 6:] = H5[:, :3], H5[:, 3:]
+    return H
+
+
+def observation(time, H5, z, R):
+    rows = len(z)
+    H, values, covariance = np.zeros((3, 5)), np.zeros(3), np.zeros((3, 3))
+    H[:rows], values[:rows], covariance[:rows, :rows] = H5, z, R
+    packed = np.zeros(track_filter.OBSERVATION)
+    track_filter.whiten(packed, time, H, values, covariance, rows)
+    return packed
+
+
+def start():
+    x = np.array([1.0, -2.0, 0.5, 0.1, 0.2, -0.3, 0.0, 0.0])
+    P = np.diag([4.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1e-4, 1e-4])
+    track = np.zeros(track_filter.TRACK)
+    track_filter.begin(track, 0.0, x, P)
+    return track, x, P
+
+
+def answer(track, time):
+    x, P = np.empty(8), np.empty((8, 8))
+    track_filter.newest(track, time, x, P, NOISE)
+    return x, P
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_order_of_arrival_gives_the_filter_that_had_them_in_order(seed):
+    rng = np.random.default_rng(seed)
+    track, x, P = start()
+    reference = Reference(x, P, 0.0, NOISE)
+    measurements = random_measurements(rng, 40, 1.0)
+    for time, H5, z, R in measurements:
+        reference.predict(time)
+        reference.fuse(full(H5), z, R)
+    reference.predict(1.1)
+    for i in rng.permutation(len(measurements)):
+        packed = observation(*measurements[i])
+        track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), NOISE)
+    x, P = answer(track, 1.1)
+    np.testing.assert_allclose(x, reference.x, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(P, reference.P, rtol=0.0, atol=1e-9)
+
+
+def test_a_full_buffer_forgets_nothing_of_what_came_in_order():
+    rng = np.random.default_rng(7)
+    track, x, P = start()
+    reference = Reference(x, P, 0.0, NOISE)
+    for time, H5, z, R in random_measurements(rng, 3 * track_filter.SLOTS, 4.0):
+        reference.predict(time)
+        reference.fuse(full(H5), z, R)
+        packed = observation(time, H5, z, R)
+        track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), NOISE)
+    assert track[track_filter.USED] == track_filter.SLOTS
+    x, P = answer(track, 4.0)
+    reference.predict(4.0)
+    np.testing.assert_allclose(x, reference.x, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(P, reference.P, rtol=0.0, atol=1e-9)
+
+
+def late_by_a_buffer(seed, noise):
+    """In order, without, and with a measurement that comes when 70 younger ones are fused."""
+    rng = np.random.default_rng(seed)
+    x, P = start()[1:]
+    truth = x + np.linalg.cholesky(P) @ rng.standard_normal(8)
+    track, (in_order, without) = start()[0], (Reference(x, P, 0.0, noise) for _ in range(2))
+    now, kept = 0.0, None
+    for i, (time, H5, _, R) in enumerate(random_measurements(rng, 130, 3.0)):
+        step = Reference(truth, np.zeros((8, 8)), now, noise)
+        step.predict(time)
+        truth = step.x + np.linalg.cholesky(step.P + 1e-15 * np.eye(8)) @ rng.standard_normal(8)
+        now = time
+        z = full(H5) @ truth + np.linalg.cholesky(R) @ rng.standard_normal(len(R))
+        in_order.predict(time)
+        in_order.fuse(full(H5), z, R)
+        packed = observation(time, H5, z, R)
+        if i == 60:
+            kept = packed
+            continue
+        without.predict(time)
+        without.fuse(full(H5), z, R)
+        assert track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), noise)
+    # 69 younger ones, more than a full buffer of 48
+    assert track_filter.insert(track, kept, np.empty(8), np.empty((8, 8)), noise)
+    late = np.empty(8), np.empty((8, 8))
+    track_filter.newest(track, now, *late, noise)
+    return truth, in_order, without, late
+
+
+def test_a_measurement_older_than_the_buffer_is_used_and_not_overrated():
+    """Never better than in order, never worse than without, and as good as it says."""
+    squared, runs = [], 120
+    for seed in range(runs):
+        truth, in_order, without, (x, P) = late_by_a_buffer(seed, NOISE)
+        assert np.linalg.eigvalsh(without.P - P).min() > -1e-12
+        assert np.linalg.eigvalsh(P - in_order.P).min() > -1e-6  # one part in a thousand
+        error = (x - truth)[:6]
+        squared.append(error @ np.linalg.solve(P[:6, :6], error))
+    low, high = chi2.ppf([0.001, 0.999], 6 * runs) / runs
+    assert low < np.mean(squared) < high
+
+
+def test_what_is_older_than_the_archive_is_refused():
+    track = start()[0]
+    measurements = random_measurements(np.random.default_rng(2), 400, 8.0)
+    for one in measurements[1:]:
+        track_filter.insert(track, observation(*one), np.empty(8), np.empty((8, 8)), NOISE)
+    before = track.copy()
+    packed = observation(*measurements[0])
+    assert not track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), NOISE)
+    np.testing.assert_array_equal(track, before)
+
+
+def test_innovation_is_normalised_with_the_prior():
+    rng = np.random.default_rng(1)
+    track, x, P = start()
+    (time, H5, z, R), *_ = random_measurements(rng, 1, 1.0)
+    reference = Reference(x, P, 0.0, NOISE)
+    reference.predict(time)
+    expected = reference.fuse(full(H5), z, R)
+    x, P = np.empty(8), np.empty((8, 8))
+    assert track_filter.prior(track, time, x, P, NOISE)
+    found, _ = track_filter.fuse(x, P, observation(time, H5, z, R))
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_shift_of_the_frame_moves_the_answer_and_nothing_else():
+    rng = np.random.default_rng(5)
+    moved, plain = start()[0], start()[0]
+    measurements = random_measurements(rng, 12, 1.0)
+    jump = np.array([3.0, -1.0, 0.5])
+    for i, (time, H5, z, R) in enumerate(measurements):
+        if i == 8:
+            track_filter.shift(moved, jump)
+        for track in (moved, plain):
+            new = z + H5[:, :3] @ jump if i >= 8 and track is moved else z
+            packed = observation(time, H5, new, R)
+            track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), NOISE)
+    shifted, P = answer(moved, 1.0)
+    x, P_plain = answer(plain, 1.0)
+    x[:3] += jump
+    np.testing.assert_allclose(shifted, x, atol=1e-9)
+    np.testing.assert_allclose(P, P_plain, atol=1e-12)
+
+
+# -- with sensors
+
+
+class World:
+    """A pad that moves as the filter supposes, seen from a vehicle that sways over it."""
+
+    def __init__(self, seed, settings, duration, pad_velocity=(0.0, 0.0, 0.0), wander=1.0):
+        self.rng = np.random.default_rng(seed)
+        self.settings, self.sway = settings, Sway(amplitude=(0.4, -0.3), height=6.0, descent=0.4)
+        self.times = OFFSET + PERIOD * np.arange(round(duration / PERIOD))
+        c = settings
+        v = np.array(pad_velocity, dtype=float)
+        p = np.array([0.5, -0.3, 0.0])
+        b = wander * c.bearing_bias * self.rng.standard_normal(2)
+        self.p, self.v, self.b = [], [], []
+        densities = np.array([c.horizontal_acceleration] * 2 + [c.vertical_acceleration])
+        root = np.linalg.cholesky(
+            np.array([[PERIOD**3 / 3, PERIOD**2 / 2], [PERIOD**2 / 2, PERIOD]])
+        )
+        decay = np.exp(-PERIOD / c.bearing_bias_time)
+        for _ in self.times:
+            self.p.append(p)
+            self.v.append(v)
+            self.b.append(b)
+            w = wander * densities[:, None] * (self.rng.standard_normal((3, 2)) @ root.T)
+            walk = wander * c.position_noise * np.sqrt(PERIOD) * self.rng.standard_normal(3)
+            p, v = p + PERIOD * v + w[:, 0] + walk, v + w[:, 1]
+            kick = wander * c.bearing_bias * np.sqrt(1 - decay**2)
+            b = decay * b + kick * self.rng.standard_normal(2)
+
+    def relative(self, k):
+        """p_BP_W at step k, m."""
+        return self.p[k] - self.sway.position(self.times[k])
+
+    def marker(self, k, arrival, noise=1.0):
+        """A MARKER measurement made at step k."""
+        s = self.settings.front_end
+        found = self.relative(k)
+        sigma_bearing = 1e-3
+        height = -found[2]
+        lateral = np.hypot(s.marker_noise, height * s.attitude_noise)
+        # bearing and range errors are small: add everything in W
+        scatter = np.array([np.hypot(lateral, height * sigma_bearing)] * 2 + [s.marker_noise])
+        found = found + noise * scatter * self.rng.standard_normal(3)
+        found[:2] += height * self.b[k]
+        p_C = np.array([-found[1], -found[0], -found[2]])
+        measurement = MARKER.zeros()
+        measurement[:4] = self.times[k], arrival, k, 1.0
+        measurement[MARKER.slice("bearing_C")] = p_C / np.linalg.norm(p_C)
+        measurement[MARKER.index("range")] = np.linalg.norm(p_C)
+        for name in ("covariance_xx", "covariance_yy"):
+            measurement[MARKER.index(name)] = sigma_bearing**2
+        measurement[MARKER.index("covariance_rr")] = 1e-8
+        return measurement
+
+    def infrared(self, k, arrival, lamps=(), noise=1.0, sees_beacon=True):
+        """An INFRARED measurement made at step k; other lamps stand at `lamps` in W, brighter."""
+        s = self.settings.front_end
+        spots = [np.asarray(lamp) - self.sway.position(self.times[k]) for lamp in lamps]
+        if sees_beacon:
+            spots.append(self.relative(k))
+        measurement = INFRARED.zeros()
+        measurement[:4] = self.times[k], arrival, k, float(bool(spots))
+        measurement[INFRARED.index("count")] = len(spots)
+        for i, spot in enumerate(spots):
+            height = -spot[2]
+            lateral = np.hypot(s.infrared_lamp_noise, height * s.attitude_noise)
+            sigma = np.hypot(lateral, height * s.infrared_angle_noise)
+            x, y = spot[:2] + noise * sigma * self.rng.standard_normal(2) + height * self.b[k]
+            measurement[INFRARED.index(f"blob_{i}_x")] = -y / height
+            measurement[INFRARED.index(f"blob_{i}_y")] = -x / height
+            measurement[INFRARED.index(f"blob_{i}_area")] = 20.0
+        return measurement
+
+    def fly(self, every=(2, 1), latency=(3, 1), lamps=lambda t: (), marker_until=np.inf, noise=1.0,
+            beacon=lambda t: True, ranged=False):  # fmt: skip
+        """Run the estimator; the targets and the hypotheses at every step."""
+        system = MultiHypothesisTarget(self.settings)
+        bench = Bench(system)
+        marker, infrared = no_measurement(MARKER), no_measurement(INFRARED)
+        bench.step(0, marker=marker, infrared=infrared, range_finder=no_measurement(RANGE_FINDER),
+                   estimate=self.sway.estimate(self.times[0]))  # fmt: skip
+        targets, hypotheses = [], []
+        for k, t in enumerate(self.times):
+            inputs = {"estimate": self.sway.estimate(t)}
+            if k >= latency[0] and k % every[0] == 0 and t < marker_until:
+                inputs["marker"] = self.marker(k - latency[0], t, noise)
+            if k >= latency[1] and k % every[1] == 0:
+                then = k - latency[1]
+                lit = lamps(self.times[then])
+                inputs["infrared"] = self.infrared(then, t, lit, noise, beacon(self.times[then]))
+            if ranged:
+                ranging = RANGE_FINDER.zeros()
+                ranging[:4] = t, t, k, 1.0
+                ranging[RANGE_FINDER.index("range")] = self.sway.position(t)[2]
+                inputs["range_finder"] = ranging
+                index = VEHICLE_ESTIMATE.index
+                inputs["estimate"][index("height_above_ground")] = self.sway.position(t)[2]
+                inputs["estimate"][index("height_above_ground_valid")] = 1.0
+            targets.append(bench.step(k, **inputs))
+            hypotheses.append(system.GetOutputPort("hypotheses").Eval(bench.context).copy())
+        return np.array(targets), np.array(hypotheses)
+
+    def errors(self, targets):
+        """Position error, shape (n, 3), m."""
+        truth = np.array([self.relative(k) for k in range(len(self.times))])
+        return targets[:, TARGET_ESTIMATE.slice("p_BP_W")] - truth
+
+
+def test_consistency_over_a_hundred_runs():
+    """The mean normalised error squared of position and velocity lies in its chi-square band."""
+    settings = config()
+    runs, sampled = 100, (48, 76, 99)
+    squared = np.zeros((runs, len(sampled), 6))
+    for run in range(runs):
+        world = World(
+            run, settings, 2.0, pad_velocity=1.5 * np.random.default_rng(run).standard_normal(3)
+        )
+        targets, _ = world.fly()
+        error = world.errors(targets)
+        for i, k in enumerate(sampled):
+            v_error = targets[k, TARGET_ESTIMATE.slice("v_WP")] - world.v[k]
+            variance = np.concatenate(
+                (
+                    targets[k, TARGET_ESTIMATE.slice("position_variance")],
+                    targets[k, TARGET_ESTIMATE.slice("velocity_variance")],
+                )
+            )
+            squared[run, i] = np.concatenate((error[k], v_error)) ** 2 / variance
+    low, high = chi2.ppf([0.0005, 0.9995], runs) / runs  # each of 18 bands, 2 % false alarms in all
+    mean = squared.mean(axis=0)
+    assert (mean > low).all()
+    assert (mean < high).all()
+
+
+LAMP = (2.0, -0.3, 0.0)  # 1.5 m from the pad
+
+
+def distance_from_pad(world, targets):
+    return np.linalg.norm(world.errors(targets)[:, :2], axis=1)
+
+
+@pytest.mark.parametrize("marker_until", [np.inf, 1.0])
+def test_a_persistent_false_beacon_does_not_move_the_target(marker_until):
+    """From 2 s on a brighter lamp; with the marker, and with the infrared camera alone."""
+    world = World(1, config(), 8.0, wander=0.0)
+    targets, hypotheses = world.fly(
+        lamps=lambda t: (LAMP,) if t > 2.0 else (), marker_until=marker_until, ranged=True
+    )
+    settled = world.times > 1.0
+    limit = 0.05 if marker_until > 8.0 else 0.1  # the infrared camera errs by 2 cm from 6 m
+    assert distance_from_pad(world, targets)[settled].max() < limit
+    assert field(targets, "acquired")[settled].all()
+    assert hypotheses[-1, TARGET_HYPOTHESES.index("probability_0")] > 0.99
+    rival = hypotheses[-1, TARGET_HYPOTHESES.index("p_WP_x_1")]
+    assert rival == pytest.approx(LAMP[0], abs=0.4)  # as its height is only guessed
+
+
+def test_a_lamp_that_was_there_first_loses_against_the_marker():
+    """The lamp alone for 1 s, the pad with its marker later: doubt, then the pad."""
+    world = World(2, config(), 6.0, wander=0.0)
+    targets, _ = world.fly(
+        lamps=lambda t: (LAMP,), beacon=lambda t: t > 1.0, latency=(70, 1), ranged=True
+    )
+    misled = (world.times > 0.5) & (world.times < 0.9)
+    assert distance_from_pad(world, targets)[misled].min() > 1.4
+    assert distance_from_pad(world, targets)[world.times > 3.0].max() < 0.1
+
+
+def test_two_lamps_from_the_start_leave_doubt():
+    """Without a marker nothing tells them apart, and the variance says so."""
+    world = World(3, config(mode="infrared"), 4.0, wander=0.0)
+    targets, hypotheses = world.fly(lamps=lambda t: (LAMP,), ranged=True)
+    assert hypotheses[-1, TARGET_HYPOTHESES.index("probability_0")] == pytest.approx(0.5)
+    sigma = np.sqrt(field(targets, "position_variance_x")[-1])
+    assert sigma == pytest.approx(1.5 * np.sqrt(0.5), rel=0.05)
+
+
+def test_the_lamp_does_not_inherit_while_the_pad_is_out_of_sight_for_a_while():
+    world = World(4, config(), 8.0, wander=0.0)
+    targets, _ = world.fly(
+        lamps=lambda t: (LAMP,) if t > 2.0 else (),
+        marker_until=3.0,
+        beacon=lambda t: not 3.0 < t < 6.0,
+        ranged=True,
+    )
+    lost = (world.times > 4.2) & (world.times < 6.0)
+    assert not field(targets, "acquired")[lost].any()
+    assert distance_from_pad(world, targets)[world.times > 3.5].max() < 0.5
+    assert field(targets, "acquired")[-1]
+    assert distance_from_pad(world, targets)[world.times > 7.0].max() < 0.05
+
+
+def test_outliers_are_rejected():
+    world = World(5, config(), 5.0, wander=0.0)
+    flicker = np.random.default_rng(9).uniform(-3.0, 3.0, (2000, 2))
+    targets, _ = world.fly(
+        lamps=lambda t: ((*flicker[int(t / PERIOD)], 0.0),) if int(t / PERIOD) % 3 == 0 else ()
+    )
+    settled = world.times > 1.0
+    assert distance_from_pad(world, targets)[settled].max() < 0.05
+
+
+@pytest.mark.parametrize("velocity", [(2.0, 0.0, 0.0), (-1.0, 2.0, 0.3)])
+def test_a_moving_pad_is_followed_with_its_velocity(velocity):
+    world = World(6, config(), 4.0, pad_velocity=velocity, wander=0.0)
+    targets, _ = world.fly()
+    settled = world.times > 2.0
+    assert np.abs(world.errors(targets)[settled]).max() < 0.06
+    found = targets[settled][:, TARGET_ESTIMATE.slice("v_WP")]
+    assert np.abs(found - velocity).max() < 0.35
+
+
+def test_a_pad_that_leaves_at_once_is_found_again_within_two_seconds():
+    """Its marker is seen elsewhere, and nothing where it was."""
+    world = World(7, config(), 7.0, wander=0.0)
+    jump = world.times > 3.0
+    world.p = [p + np.array([1.5, 0.0, 0.0]) * late for p, late in zip(world.p, jump, strict=True)]
+    targets, _ = world.fly()
+    assert distance_from_pad(world, targets)[world.times > 5.0].max() < 0.06
+
+
+@pytest.mark.parametrize("latency", [(3, 1), (20, 12)])
+def test_latency_needs_no_parameter(latency):
+    """0.3 s and 0.2 s late, out of order, without noise: still where the pad is."""
+    world = World(8, config(), 5.0, wander=0.0)
+    targets, _ = world.fly(latency=latency, noise=0.0)
+    settled = world.times > 2.0
+    assert distance_from_pad(world, targets)[settled].max() < 2e-3
+
+
+def test_one_failing_sensor_is_survived():
+    sway = Sway(amplitude=(0.3, -0.2))
+    times, targets = simulate(config(), Scene(sway, marker_until=4.0, infrared_until=8.0), 7.9)
+    settled = times > 1.0
+    assert field(targets, "acquired")[settled].all()
+    assert np.abs(horizontal_error(times, targets, sway)[settled]).max() < 0.02
+    times, targets = simulate(
+        config(mode="marker"), Scene(Sway(), marker_until=4.0, infrared_until=8.0), 7.0
+    )
+    assert not field(targets, "acquired")[times > 5.1].any()
+
+
+def test_configure_makes_a_used_estimator_a_new_one():
+    wanted = config(mode="infrared", lost_time=0.5)
+
+    class Reused(MultiHypothesisTargetConfig):
+        def add_to(self, builder, name, seed=0):
+            estimator = super().add_to(builder, name, seed)
+            estimator.configure(wanted, seed)
+            return estimator
+
+    scene = [Scene(Sway(), marker_until=1.0, infrared_until=3.0) for _ in range(2)]
+    answers = [simulate(c, s, 4.0)[1] for c, s in zip((wanted, Reused()), scene, strict=True)]
+    np.testing.assert_array_equal(answers[0], answers[1])
+    assert field(answers[0], "acquired").any()
+    assert not field(answers[0], "acquired")[-1]
+
+
+def test_a_reset_of_the_navigation_filter_does_not_move_the_target():
+    class Jumping(Sway):
+        def estimate(self, t):
+            estimate = super().estimate(t)
+            if t > 2.0:
+                estimate[VEHICLE_ESTIMATE.index("p_WB_x")] += 3.0
+                estimate[VEHICLE_ESTIMATE.index("horizontal_reset_counter")] = 1.0
+                estimate[VEHICLE_ESTIMATE.index("horizontal_reset_x")] = 3.0
+            return estimate
+
+    world = World(9, config(), 4.0, wander=0.0)
+    world.sway = Jumping(amplitude=(0.4, -0.3), height=6.0, descent=0.4)
+    targets, _ = world.fly(noise=0.0)
+    settled = world.times > 1.5
+    assert field(targets, "acquired")[settled].all()
+    assert distance_from_pad(world, targets)[settled].max() < 0.01

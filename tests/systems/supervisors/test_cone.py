@@ -1,0 +1,265 @@
+"""The landing down a cone: its table, its decisions, its flights, the wind it observes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from systems.schedule import SUPERVISOR_PERIOD
+from systems.supervisors.cone import Cone, ConeConfig, ConeMemory
+from systems.supervisors.landing_supervisor import LandingSupervisor, LandingSupervisorConfig
+from systems.supervisors.mission import MissionConfig, flight_table
+from systems.supervisors.situation import Situation
+from systems.supervisors.state_machine import problems
+from tests.system_contract import assert_matches_docstring, periodic_update
+from tests.systems.supervisors.point_mass import Flight, PointMass
+
+PAD = (0.3, -0.2)
+GRAVITY = 9.80665
+
+
+def settings(**fields) -> ConeConfig:
+    # The point mass stands with its origin on the ground.
+    return ConeConfig(feet_height=0.0, **fields)
+
+
+def fly(duration=200.0, altitude=6.0, pad=PAD, **plant) -> Flight:
+    routine = plant.pop("routine", settings())
+    mission = MissionConfig(altitude=altitude, side=0.0, settle_time=0.0)
+    config = LandingSupervisorConfig(routine=routine, mission=mission)
+    return Flight(config, PointMass(pad=pad, **plant), duration)
+
+
+def situation(**fields) -> Situation[ConeMemory]:
+    """A vehicle that hovers level 1 m over a pad at the origin, in sight for a while."""
+    s = Situation(ConeMemory(), SUPERVISOR_PERIOD)
+    s.time, s.z, s.height, s.acquired, s.goal_sigma = 50.0, 1.0, 1.0, True, 0.01
+    s.goal_x = s.goal_y = s.goal_z = 0.0
+    m = s.memory
+    m.known, m.pad_x, m.pad_y, m.pad_z = 1.0, 0.0, 0.0, 0.0
+    m.landing_started, m.hover_command, m.attempts = 20.0, 0.4, 1.0
+    s.command = 0.4
+    for name, value in fields.items():
+        setattr(m if hasattr(m, name) else s, name, value)
+    return s
+
+
+def test_topology():
+    supervisor = LandingSupervisor(LandingSupervisorConfig(routine=settings()))
+    assert_matches_docstring(supervisor)
+    assert periodic_update(supervisor) == (SUPERVISOR_PERIOD, 0.0)
+
+
+def test_table_is_sound():
+    assert problems(flight_table(Cone.table)) == []
+    assert 'label="' in LandingSupervisor(LandingSupervisorConfig(routine=settings())).states_dot()
+
+
+# -- flights
+
+
+def test_lands_on_the_pad():
+    flight = fly()
+    assert flight.landed
+    assert flight.states[-4:] == ["descend", "settle", "touch", "landed"]
+    np.testing.assert_allclose(flight.position[:2], PAD, atol=0.03)
+    assert flight.status.attempts[-1] == 1.0
+
+
+def test_a_pad_far_away_is_approached_before_the_descent():
+    flight = fly(pad=(-8.0, 3.0))
+    assert flight.landed
+    np.testing.assert_allclose(flight.position[:2], (-8.0, 3.0), atol=0.05)
+    at = flight.estimates
+    outside = np.hypot(at.p_WB_x + 8.0, at.p_WB_y - 3.0) > 3.0
+    landing = flight.times > flight.time_of("descend")
+    assert at.p_WB_z[outside & landing].min() > 5.5
+
+
+def test_the_descent_stays_in_the_cone():
+    flight = fly(pad=(-3.0, 0.0))
+    c = settings()
+    at, down = flight.estimates, flight.setpoints.v_WB_z < -0.05
+    radius = c.cone_radius + c.cone_slope * np.maximum(at.p_WB_z, 0.0)
+    landing = flight.times > flight.time_of("descend")
+    assert (np.hypot(at.p_WB_x + 3.0, at.p_WB_y) <= radius + 0.02)[landing & down].all()
+
+
+@pytest.mark.parametrize("velocity", [(2.0, 0.0), (-0.5, 1.0)])
+def test_lands_on_a_moving_pad(velocity):
+    flight = fly(pad_velocity=velocity)
+    assert flight.landed
+    # The point mass stops where it touches; the pad goes on until that is noticed.
+    touched = flight.times[-1]
+    miss = flight.position[:2] - np.array(PAD) - np.array(velocity) * touched
+    assert np.hypot(*miss) < 0.1 + np.hypot(*velocity) * 1.5
+
+
+def test_rises_when_it_loses_sight_and_goes_on():
+    flight = fly(visible=lambda t, z: not 5.0 < t < 8.5)
+    assert ("hold", "descend") in flight.transitions
+    assert flight.landed
+    np.testing.assert_allclose(flight.position[:2], PAD, atol=0.03)
+
+
+def test_goes_round_when_sight_is_lost_for_long():
+    flight = fly(visible=lambda t, z: not 5.0 < t < 12.0)
+    assert ("hold", "go_round") in flight.transitions
+    assert flight.landed
+    assert flight.status.attempts[-1] == 2.0
+    np.testing.assert_allclose(flight.position[:2], PAD, atol=0.03)
+
+
+def test_attempts_are_bounded_when_the_pad_is_never_seen_close_by():
+    flight = fly(visible=lambda t, z: z > 3.0)
+    assert flight.landed
+    assert flight.status.attempts[-1] == settings().maximum_attempts
+    assert flight.landing_time < settings().maximum_time + 25.0
+    np.testing.assert_allclose(flight.position[:2], PAD, atol=0.3)
+
+
+def test_searches_a_spiral_and_then_lands_anyway():
+    flight = fly(visible=lambda t, z: False)
+    assert ("look", "search") in flight.transitions
+    assert ("search", "land_anyway") in flight.transitions
+    assert flight.landed
+    np.testing.assert_allclose(flight.position[:2], (2.0, 0.0), atol=0.3)  # where it climbed
+    at = flight.estimates
+    searching = (flight.times > flight.time_of("search")) & (
+        flight.times < flight.time_of("land_anyway")
+    )
+    radius = np.hypot(at.p_WB_x - 2.0, at.p_WB_y)[searching]
+    assert radius.max() > 0.8 * settings().search_radius
+    # No winding is further from the one before than the camera sees across.
+    angle = np.unwrap(np.arctan2(at.p_WB_y, at.p_WB_x - 2.0)[searching])
+    turns = np.interp(angle[200:] - 2 * math.pi, angle, radius)
+    assert (radius[200:] - turns)[angle[200:] > angle[0] + 4 * math.pi].max() < 2 * 0.3 * 6.0
+
+
+def test_finds_a_pad_on_the_spiral():
+    # In sight only within 2 m, 6 m beside the mission's end.
+    pad = (2.0, 6.0)
+    plant: dict[str, PointMass] = {}
+
+    def visible(t, z):
+        body = plant["system"].position_now
+        return math.hypot(body[0] - pad[0], body[1] - pad[1]) < 2.0
+
+    class Watched(PointMass):
+        position_now = (2.0, 0.0)
+
+        def _update(self, context, discrete_state):
+            self.position_now = context.get_discrete_state_vector().value()[:2].copy()
+            return super()._update(context, discrete_state)
+
+    mission = MissionConfig(altitude=6.0, side=0.0, settle_time=0.0)
+    plant["system"] = Watched(pad=pad, visible=visible)
+    config = LandingSupervisorConfig(routine=settings(), mission=mission)
+    flight = Flight(config, plant["system"], 200.0)
+    assert ("search", "descend") in flight.transitions
+    assert flight.landed
+    np.testing.assert_allclose(flight.position[:2], pad, atol=0.05)
+
+
+def test_time_is_bounded():
+    """A pad that runs away faster than the vehicle: the landing ends all the same."""
+    c = settings(maximum_time=10.0, return_time=5.0)
+    flight = fly(routine=c, pad=(-60.0, 0.0), pad_velocity=(-8.0, 0.0))
+    assert flight.states[-2:] == ["land_anyway", "landed"]
+    assert flight.landing_time < 10.0 + 5.0 + 20.0
+
+
+def test_never_a_hard_landing():
+    for flight in (fly(), fly(visible=lambda t, z: z > 3.0), fly(visible=lambda t, z: False)):
+        assert flight.estimates.v_WB_z[flight.estimates.p_WB_z < 0.2].min() > -0.7
+
+
+# -- decisions
+
+
+def descent(s):
+    Cone(settings()).descend_in_cone(s)
+    return -s.memory.setpoint_vz
+
+
+def test_uncertainty_stops_the_descent_as_an_error_does():
+    assert descent(situation()) > 0.3
+    assert descent(situation(x=0.5)) <= 0.0
+    assert descent(situation(goal_sigma=0.25)) <= 0.0
+    assert descent(situation(x=1.5)) < -0.1
+
+
+def test_touches_down_when_the_prediction_is_good_and_sooner_or_later():
+    cone = Cone(settings())
+    low = {"z": 0.15, "goal_sigma": 0.002}
+    assert cone.aligned(situation(**low, x=0.01, entered=50.0))
+    assert not cone.aligned(situation(**low, x=0.06, entered=50.0))
+    assert not cone.aligned(situation(**low, x=0.01, vx=0.3, entered=50.0))
+    assert not cone.aligned(situation(z=0.6, x=0.0, entered=50.0))
+    patience = settings().patience
+    assert cone.aligned(situation(**low, x=0.06, entered=50.0 - patience))
+
+
+def test_misses_are_aborted_while_there_is_room():
+    cone = Cone(settings())
+    assert cone.missing_pad(situation(z=0.1, x=0.2))
+    assert not cone.missing_pad(situation(z=0.1, x=0.05))
+    assert not cone.missing_pad(situation(z=0.03, x=0.2))
+
+
+def test_the_ground_is_felt_and_a_gust_is_not():
+    cone = Cone(settings())
+    falling = {"setpoint_vz": -0.4, "setpoint_z": math.nan, "vz": -0.3, "push": 1.0}
+    assert cone.on_the_ground(situation(z=0.01, az=5.0, **falling))
+    assert not cone.on_the_ground(situation(z=0.01, az=3.0, **falling))
+    assert not cone.on_the_ground(situation(z=0.8, az=5.0, **falling))
+    climbing = {**falling, "setpoint_vz": 0.3}
+    assert not cone.on_the_ground(situation(z=0.01, az=5.0, **climbing))
+
+
+def test_blown_away_goes_back_into_the_cone():
+    cone = Cone(settings())
+    assert cone.blown_away(situation(z=0.2, x=0.5))
+    assert not cone.blown_away(situation(z=0.2, x=0.1))
+
+
+# -- the wind
+
+
+def test_a_steady_push_is_observed_and_fed_forward():
+    """A wind that begins after the landing did: −d̂ follows it within half a second."""
+    cone = Cone(settings())
+    s = situation(time=20.0)
+    s.memory.landing_started = 20.0
+    for k in range(100):
+        s.time = 20.0 + SUPERVISOR_PERIOD * k
+        wind = 0.6 if s.time > 22.0 else 0.2
+        s.ax = wind  # nothing holds against it yet: the vehicle is level and accelerates
+        cone.observe_drift(s)
+        if s.time <= 20.9:
+            assert s.memory.setpoint_ax == 0.0
+    assert s.memory.drift_ax == pytest.approx(0.6, abs=0.01)
+    # The first 0.2 m/s2 are the integrator's.
+    assert s.memory.setpoint_ax == pytest.approx(-0.4, abs=0.01)
+
+
+def test_a_lean_that_makes_no_acceleration_is_wind_too():
+    cone = Cone(settings())
+    s = situation(time=20.0)
+    lean = 0.1
+    s.up_x, s.up_z = -math.sin(lean), math.cos(lean)
+    s.command = 0.4 / math.cos(lean)
+    for k in range(200):
+        s.time = 20.0 + SUPERVISOR_PERIOD * k
+        cone.observe_drift(s)
+    assert s.memory.drift_ax == pytest.approx(GRAVITY * math.tan(lean), rel=1e-3)
+    assert s.memory.push == pytest.approx(0.0, abs=1e-3)
+    # Leaning it aims upwind, for it will fall back on its feet.
+    x, _ = Cone(ConeConfig())._goal(s)
+    assert x == pytest.approx(-0.2 * math.tan(lean), rel=1e-3)
+
+
+def test_a_heaving_pad_is_sunk_with():
+    s = situation(pad_uz=0.2)
+    level = situation()
+    assert descent(s) == pytest.approx(descent(level) - 0.2)
