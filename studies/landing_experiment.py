@@ -1,5 +1,6 @@
 """The experiment of most studies: one landing of a scenario with overrides."""
 
+from math import nan
 from typing import Any
 
 import cv2
@@ -7,6 +8,7 @@ import cv2
 from diagrams.loading import ScenarioError, load_scenario, with_overrides
 from runs.run import laboratory
 from studies.study import Study, StudyError
+from systems.signals.measurement import SUPERVISOR_STATUS
 
 
 class LandingExperiment:
@@ -34,13 +36,20 @@ class LandingExperiment:
         -------
         dict
             `landed`, `reason`, `landing_error_m`, `landing_x_m`, `landing_y_m`,
-            `landing_time_s`, `touchdown_speed_m_s`, `attempts`, `simulated_s`, `cpu_s`.
+            `landing_time_s` (to the first contact), `time_to_disarm_s` (to the stopped rotors,
+            both from the start of the landing routine), `touchdown_speed_m_s`, `attempts`,
+            `simulated_s`, `cpu_s`.
         """
         try:
             scenario = with_overrides(self._scenario, {**overrides, "seed": seed})
         except ScenarioError as error:
             raise StudyError(str(error)) from None
-        result = laboratory(scenario).fly()
+        lab = laboratory(scenario)
+        simulator = lab.start()
+        result = lab.fly(simulator)
+        context = simulator.get_context()
+        status = SUPERVISOR_STATUS(lab.landing.evaluate("supervisor", context))
+        disarmed = context.get_time() - status.time_in_state if status.landed_detected else nan
         x, y = result.landing_offset_m
         return {
             "landed": result.landed,
@@ -49,6 +58,7 @@ class LandingExperiment:
             "landing_x_m": x,
             "landing_y_m": y,
             "landing_time_s": result.landing_time_s,
+            "time_to_disarm_s": disarmed - status.landing_started,
             "touchdown_speed_m_s": result.touchdown_speed_m_s,
             "attempts": result.attempts,
             "simulated_s": result.simulated_s,

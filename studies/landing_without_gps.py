@@ -1,279 +1,87 @@
-"""The studies of the thesis as data: what varies and which published tables they meet.
+"""The campaigns without GPS held against the thesis's tables (Leonard 2016, chapter 6).
 
-A study is a base (dotted scenario path: value, on top of the default
-`LandingWithoutGpsScenario`) and cases that add to it; the names of the cases
-are those of `studies.published_landing_without_gps`. Every run of a case draws
-its sensors' constant errors from its own seed, as section 5.3 does.
+    plumbline study landing-without-gps-terrain …
+    python -m studies.landing_without_gps out/studies
 
-LongAccuracy and LatAccuracy are secret. Each is set once in metres, by the
-reference row of the loop alone (Table 4 in open loop, Table 22 in closed
-loop): the quantile of the absolute error at 100 m that the published share
-names. Every other row is then predicted.
+prints every published number beside the campaigns' own.
+
+LongAccuracy and LatAccuracy are secret. Each is set once, in metres, by the
+reference row of the loop alone (Table 4 in open loop, Table 22 in closed loop): the
+quantile of the absolute error at 100 m that the published share names. Table 4 has no
+lateral column, so LatAccuracy is that of Table 22 in both loops. Every other
+row is then predicted.
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
+import pandas as pd
 
-from diagrams.landing_without_gps import LandingWithoutGpsScenario
-from systems.controllers.fixed_wing_guidance import fly_back
+from studies.published_landing_without_gps import PUBLISHED, PublishedRow, published
 
-# the flight of section 6.1: recorded, its altitude 4 m too high (Table 6)
-_RECORDED: dict[str, Any] = {
-    "aircraft": {"kind": "recorded_flight", "altitude_error": 4.0},
-    "filter.tuning": "theoretical",
-    # the errors drawn for the filter's start are those of X and Y only: it believes its altitude,
-    # which is off by the altimeter's bias (6.1, Filter's Initial Parameters)
-    "gps": {
-        "horizontal_noise": 50.0,
-        "vertical_noise": 5.0,
-        "speed_noise": 0.2,
-        "reported_vertical_accuracy": 0.5,
-    },
+PREFIX = "landing-without-gps-"
+STUDY_OF_TABLE: dict[int, str] = {
+    **dict.fromkeys((4, 5, 7, 8, 9, 11, 12), "terrain"),
+    **dict.fromkeys((6, 10), "altitude"),
+    **dict.fromkeys(range(13, 21), "harmonisation"),
+    **dict.fromkeys((22, 24, 25), "latency-closed"),
+    **dict.fromkeys((23, 26, 27, 28, 29), "latency-open"),
 }
-_SIMULATED_VISION: dict[str, Any] = {"aircraft": {"kind": "recorded_flight"}}
-_RETURN = fly_back()
+# rows of the thesis that are one variant of a study
+_SAME = {
+    "flat_100m": "flat",
+    "slope_100m": "slope",
+    "flat_no_laser": "no_laser",
+    "slope_no_laser": "no_laser",
+    "yaw_0.0": "pitch_0.0",
+    "roll_0.0": "pitch_0.0",
+    "closed": "closed_camera_0ms",
+    "open": "open_camera_0ms",
+    "open_vision_0ms": "open_camera_40ms",
+}
+POINTS = 0.10  # a percentage agrees if it lies within ten points
+_OPEN_REFERENCE, _CLOSED_REFERENCE = (4, "no_laser"), (22, "closed")
 
 
 @dataclass(frozen=True)
-class LandingStudy:
-    """One study.
+class Accuracy:
+    """What the thesis keeps secret, in metres."""
 
-    Attributes
-    ----------
-    name : str
-    tables : tuple of int
-        Of the thesis, whose percentages it meets.
-    figures : tuple of int
-        Of the thesis, which it redraws.
-    runs : int
-        Runs of each case in the thesis.
-    base : dict
-        Dotted scenario path: value, for every case.
-    cases : dict
-        Name: dotted scenario path: value.
-    reference : str
-        The case that the others are compared with.
-    """
+    long_open: float  # LongAccuracy by Table 4
+    long_closed: float  # LongAccuracy by Table 22
+    lat: float  # LatAccuracy by Table 22
 
-    name: str
-    tables: tuple[int, ...]
+    def of(self, row: PublishedRow) -> float:
+        """The one that a published row is in units of."""
+        if row.axis == "lateral":
+            return self.lat
+        closed = STUDY_OF_TABLE[row.table] == "latency-closed"
+        return self.long_closed if closed else self.long_open
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One published number beside the campaign's."""
+
+    row: PublishedRow
+    value: float
     runs: int
-    cases: dict[str, dict[str, Any]]
-    base: dict[str, Any] = field(default_factory=dict)
-    reference: str = ""
-    figures: tuple[int, ...] = ()
 
-    def scenario(self, case: str) -> LandingWithoutGpsScenario:
-        """The scenario of a case.
-
-        Raises
-        ------
-        KeyError
-            If the study has no such case.
-        """
-        return scenario_with({**self.base, **self.cases[case]}, name=f"{self.name}_{case}")
+    @property
+    def agrees(self) -> bool | None:
+        """Within ten points; None for what is no percentage."""
+        if self.row.statistic != "valid":
+            return None
+        return abs(self.value - self.row.value) <= POINTS
 
 
-def scenario_with(overrides: Mapping[str, Any], name: str) -> LandingWithoutGpsScenario:
-    """The default scenario with dotted paths replaced; an invalid one raises `ValueError`."""
-    tree: dict[str, Any] = {"name": name}
-    for path, value in overrides.items():
-        *parents, leaf = path.split(".")
-        node = tree
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[leaf] = value
-    kinds = {"aircraft": "fixed_wing", "filter": "error_filter", "camera": "geometric"}
-    for member, kind in kinds.items():
-        if member in tree:
-            tree[member].setdefault("kind", kind)
-    default = LandingWithoutGpsScenario()
-    if "flight_controller" not in tree:
-        tree["flight_controller"] = default.flight_controller
-    if "gps" not in tree:
-        tree["gps"] = default.gps
-    return TypeAdapter(LandingWithoutGpsScenario).validate_python(tree)
-
-
-def _harmonisation(axis: str, degrees: Iterable[float]) -> dict[str, dict[str, Any]]:
-    """Cases of one axis; the scenario's error is the standard deviation of a normal law (6.2)."""
-    others = {
-        f"camera.harmonisation_{other}_spread": 0.0
-        for other in ("roll", "pitch", "yaw")
-        if other != axis
-    }
-    return {
-        f"{axis}_{value:.1f}": {**others, f"camera.harmonisation_{axis}_spread": value}
-        for value in degrees
-    }
-
-
-_TERRAINS: dict[str, dict[str, Any]] = {
-    "no_laser": {"phases.use_laser": False},
-    **{
-        kind: {"terrain": {"kind": kind}}
-        for kind in ("flat", "obstacle", "slope", "cliff", "plateau")
-    },
-}
-_PERFECT_VISION = {"tracker.click_spread": 0.0, "tracker.noise": 0.0}
-
-STUDIES: dict[str, LandingStudy] = {
-    study.name: study
-    for study in (
-        LandingStudy(
-            name="terrain",
-            tables=(4, 5, 7, 8, 9),
-            figures=(20, 29, 32, 34, 35),
-            runs=1500,
-            base=_RECORDED,
-            cases={name: case for name, case in _TERRAINS.items() if name != "plateau"},
-            reference="no_laser",
-        ),
-        LandingStudy(
-            name="altitude_correction",
-            tables=(6,),
-            runs=1500,
-            base={"aircraft.kind": "recorded_flight"},
-            cases={
-                "altitude_as_recorded": {"aircraft.altitude_error": 4.0},
-                "altitude_corrected": {"aircraft.altitude_error": 0.0},
-            },
-            reference="altitude_as_recorded",
-        ),
-        LandingStudy(
-            name="cliff_and_plateau",
-            tables=(10,),
-            runs=1500,
-            base={"aircraft": {"kind": "recorded_flight", "altitude_error": 4.0}},
-            cases={name: _TERRAINS[name] for name in ("cliff", "plateau")},
-            reference="cliff",
-        ),
-        *(
-            LandingStudy(
-                name=f"laser_activation_{terrain}",
-                tables=(table,),
-                runs=1500,
-                base={**_RECORDED, "terrain": {"kind": terrain}},
-                cases={
-                    f"{terrain}_100m": {"laser.activation_height": 100.0},
-                    f"{terrain}_50m": {"laser.activation_height": 50.0},
-                    f"{terrain}_25m": {"laser.activation_height": 25.0},
-                    f"{terrain}_no_laser": {"phases.use_laser": False},
-                },
-                reference=f"{terrain}_100m",
-            )
-            for terrain, table in (("flat", 11), ("slope", 12))
-        ),
-        LandingStudy(
-            name="harmonisation_pitch",
-            tables=(13, 14),
-            runs=1000,
-            base={**_SIMULATED_VISION, **_PERFECT_VISION},
-            cases=_harmonisation("pitch", (0.0, 0.3, 0.5, 0.7, 0.9)),
-            reference="pitch_0.0",
-        ),
-        LandingStudy(
-            name="harmonisation_yaw",
-            tables=(15, 16),
-            runs=1000,
-            base={**_SIMULATED_VISION, **_PERFECT_VISION},
-            cases=_harmonisation("yaw", (0.0, 0.3, 0.5, 0.7, 0.9)),
-            reference="yaw_0.0",
-        ),
-        LandingStudy(
-            name="harmonisation_roll",
-            tables=(17, 18, 19, 20),
-            runs=1000,
-            base={**_SIMULATED_VISION, **_PERFECT_VISION},
-            cases=_harmonisation("roll", (0.0, 0.5, 1.0, 1.5, 2.0)),
-            reference="roll_0.0",
-        ),
-        LandingStudy(
-            name="reference",
-            tables=(22, 23),
-            runs=1000,
-            cases={"closed": {}, "open": _SIMULATED_VISION},
-            reference="closed",
-        ),
-        LandingStudy(
-            name="camera_latency_closed",
-            tables=(24, 25),
-            figures=(40, 41),
-            runs=1000,
-            cases={
-                f"closed_camera_{ms}ms": {"camera.latency": ms / 1000.0} for ms in (0, 50, 100, 500)
-            },
-            reference="closed_camera_0ms",
-        ),
-        LandingStudy(
-            name="camera_latency_open",
-            tables=(26, 27),
-            figures=(40, 41),
-            runs=1000,
-            base=_SIMULATED_VISION,
-            cases={f"open_camera_{ms}ms": {"camera.latency": ms / 1000.0} for ms in (0, 40, 100)},
-            reference="open_camera_0ms",
-        ),
-        LandingStudy(
-            name="vision_latency_open",
-            tables=(28, 29),
-            runs=1000,
-            base={**_SIMULATED_VISION, "camera.latency": 0.04},
-            cases={
-                f"open_vision_{ms}ms": {"tracker.delay": ms / 1000.0} for ms in (0, 150, 200, 250)
-            },
-            reference="open_vision_0ms",
-        ),
-        LandingStudy(
-            name="fly_back",
-            tables=(),
-            figures=(9, 42),
-            runs=10,
-            base={
-                "terrain": {"kind": "coastal"},
-                "gps": {"loss_time": 30.0},
-                "flight_controller.route": {"waypoints": _RETURN},
-                "aircraft.start": _RETURN[0],
-                "aircraft.start_course": math.degrees(
-                    math.atan2(_RETURN[1][0] - _RETURN[0][0], _RETURN[1][1] - _RETURN[0][1])
-                ),
-                "aircraft.start_vertical_speed": 0.0,
-            },
-            cases={"error_filter": {}, "improved_filter": {"filter.kind": "improved_filter"}},
-            reference="error_filter",
-        ),
-        LandingStudy(
-            name="one_landing",
-            tables=(),
-            figures=tuple(range(43, 52)),
-            runs=1,
-            base={"aircraft": {"kind": "recorded_flight"}, "terrain": {"kind": "coastal"}},
-            cases={"one_landing": {}},
-            reference="one_landing",
-        ),
-        LandingStudy(
-            name="improved_filter",
-            tables=(22,),
-            runs=1000,
-            cases={
-                "closed": {},
-                "improved": {"filter.kind": "improved_filter"},
-                "improved_in_wind": {
-                    "filter.kind": "improved_filter",
-                    "aircraft.dynamics": "lagged",
-                    "aircraft.wind_spread": 2.5,
-                    "aircraft.turbulence_wind": 5.0,
-                },
-            },
-            reference="closed",
-        ),
-    )
-}
+def variant_of(row: PublishedRow) -> str:
+    """The variant of `STUDY_OF_TABLE` that flies a published row."""
+    return _SAME.get(row.case, row.case)
 
 
 def calibrated_accuracy(errors: np.ndarray, valid_share: float) -> float:
@@ -287,6 +95,111 @@ def calibrated_accuracy(errors: np.ndarray, valid_share: float) -> float:
         The published share of valid simulations there, 0..1.
     """
     return float(np.quantile(np.abs(errors), valid_share))
+
+
+def read_campaigns(folder: Path) -> dict[str, pd.DataFrame]:
+    """The finished campaigns in a folder, by the study's name without the prefix."""
+    return {
+        path.parent.name.removeprefix(PREFIX): pd.read_parquet(path)
+        for path in sorted(folder.glob(f"{PREFIX}*/runs.parquet"))
+    }
+
+
+def calibrate(campaigns: dict[str, pd.DataFrame]) -> Accuracy:
+    """LongAccuracy and LatAccuracy from the reference rows; raises `KeyError` without them."""
+
+    def share(reference: tuple[int, str], axis: str) -> tuple[np.ndarray, float]:
+        (row,) = (
+            r for r in published(*reference, "valid") if r.axis == axis and r.distance == 100.0
+        )
+        return _errors(campaigns, row), row.value
+
+    return Accuracy(
+        long_open=calibrated_accuracy(*share(_OPEN_REFERENCE, "longitudinal")),
+        long_closed=calibrated_accuracy(*share(_CLOSED_REFERENCE, "longitudinal")),
+        lat=calibrated_accuracy(*share(_CLOSED_REFERENCE, "lateral")),
+    )
+
+
+def predict(campaigns: dict[str, pd.DataFrame], accuracy: Accuracy) -> list[Prediction]:
+    """Every published row whose campaign is there. A landing that did not get there is invalid."""
+    predictions = []
+    for row in PUBLISHED:
+        if STUDY_OF_TABLE[row.table] not in campaigns:
+            continue
+        error = _errors(campaigns, row) / accuracy.of(row)
+        if row.statistic == "valid":
+            value = float(np.mean(np.abs(error) <= 1.0))
+        elif row.statistic == "mean":
+            value = float(np.nanmean(error))
+        elif row.statistic == "largest":
+            value = _largest(campaigns, row) / accuracy.of(row)
+        else:
+            value = float(np.nanstd(error))
+        predictions.append(Prediction(row, value, len(error)))
+    return predictions
+
+
+def agreement(predictions: Iterable[Prediction]) -> tuple[int, int]:
+    """How many percentages lie within ten points, and how many there are."""
+    verdicts = [p.agrees for p in predictions if p.agrees is not None]
+    return sum(verdicts), len(verdicts)
+
+
+def markdown(predictions: list[Prediction], accuracy: Accuracy) -> str:
+    """Every table: ours / published, percentages apart by more than ten points in bold."""
+    lines = [
+        f"LongAccuracy {accuracy.long_open:.1f} m (Table 4), {accuracy.long_closed:.1f} m "
+        f"(Table 22); LatAccuracy {accuracy.lat:.2f} m (Table 22).",
+        "",
+    ]
+    for table in sorted({p.row.table for p in predictions}):
+        rows = [p for p in predictions if p.row.table == table]
+        distances = sorted({p.row.distance for p in rows}, reverse=True)
+        good, of = agreement(rows)
+        verdict = f"; {good} of {of} within ten points" if of else ""
+        lines += [f"**Table {table}** ({rows[0].row.axis}, {rows[0].runs} runs a row{verdict})", ""]
+        lines.append("| | " + " | ".join(f"{d:.0f} m" for d in distances) + " |")
+        lines.append("|---" * (1 + len(distances)) + "|")
+        for key in dict.fromkeys((p.row.axis, p.row.case, p.row.statistic) for p in rows):
+            cells = {
+                p.row.distance: _cell(p)
+                for p in rows
+                if (p.row.axis, p.row.case, p.row.statistic) == key
+            }
+            axis, case, statistic = key
+            name = case.replace("_", " ")
+            name += f", {axis}" if table in (22, 23) else ""
+            label = "largest on the way" if statistic == "largest" else statistic.replace("_", " ")
+            name += "" if statistic == "valid" else f", {label}"
+            lines.append(f"| {name} | " + " | ".join(cells.get(d, "") for d in distances) + " |")
+        lines.append("")
+    good, of = agreement(predictions)
+    lines.append(f"{good} of {of} percentages ({good / max(of, 1):.0%}) lie within ten points.")
+    return "\n".join(lines)
+
+
+def _cell(prediction: Prediction) -> str:
+    value, row = prediction.value, prediction.row
+    if row.statistic != "valid":
+        return f"{value:.2f} / {row.value:.2f}"
+    text = f"{100 * value:.0f} / {100 * row.value:.0f} %"
+    return text if prediction.agrees else f"**{text}**"
+
+
+def _largest(campaigns: dict[str, pd.DataFrame], row: PublishedRow) -> float:
+    """The largest |mean| + 1 σ (m) at the recorded distances from 1 km on ("Error max 1σ")."""
+    table = campaigns[STUDY_OF_TABLE[row.table]]
+    runs = table[table["variant"].eq(variant_of(row))]
+    names = [f"{row.axis}_{distance}" for distance in (1000, 500, 300, 150, 100)]
+    errors = runs[[name for name in names if name in runs]].to_numpy(dtype=float)
+    return float(np.nanmax(np.abs(np.nanmean(errors, axis=0)) + np.nanstd(errors, axis=0)))
+
+
+def _errors(campaigns: dict[str, pd.DataFrame], row: PublishedRow) -> np.ndarray:
+    table = campaigns[STUDY_OF_TABLE[row.table]]
+    runs = table[table["variant"].eq(variant_of(row))]
+    return runs[f"{row.axis}_{row.distance:g}"].to_numpy(dtype=float)
 
 
 def equivalent_angular_error(position_error: float, distance: float, slope: float = 6.0) -> float:
@@ -305,3 +218,9 @@ def equivalent_angular_error(position_error: float, distance: float, slope: floa
     """
     gamma = math.radians(slope)
     return math.degrees(math.atan(position_error * (math.cos(gamma) + math.sin(gamma)) / distance))
+
+
+if __name__ == "__main__":
+    found = read_campaigns(Path(sys.argv[1] if len(sys.argv) > 1 else "out/studies"))
+    secret = calibrate(found)
+    print(markdown(predict(found, secret), secret))

@@ -19,6 +19,7 @@ from studies.study import Condition, Study
 from studies.summary import (
     CONFIDENCE,
     LISTS,
+    agreement,
     published_trials,
     scale_of,
     show,
@@ -38,7 +39,7 @@ def write_report(
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.globals.update(show=show, show_rate=show_rate)
+    environment.globals.update(agreement=agreement, show=show, show_rate=show_rate)
     with figures.style():
         drawn = _figures(study, with_measures(study, table), summary)
     html = environment.from_string(template).render(

@@ -182,6 +182,18 @@ def comparisons(study: Study, landed: pd.DataFrame) -> list[Comparison]:
     ]
 
 
+def agreement(summary: Mapping[str, Any]) -> str:
+    """How many rows agree with the published trials, in one sentence."""
+    counts = {}
+    for quantity in ("error", "time"):
+        rows = [row for row in summary["published"] if row["quantity"] == quantity]
+        counts[quantity] = f"{sum(row['agrees'] for row in rows)} of {len(rows)} rows"
+    return (
+        f"{counts['error']} agree with the published trials in landing error, "
+        f"{counts['time']} in landing time."
+    )
+
+
 def published_trials(study: Study, condition: Condition) -> Any:
     """The `PublishedTrials` a condition is held against, or None."""
     variant = study.variants.get(condition.variant)
@@ -259,7 +271,7 @@ def markdown(study: Study, summary: Mapping[str, Any]) -> str:
             for row in summary["paired"]
         ]
     if summary["published"]:
-        lines += ["", "## Against the published trials", ""]
+        lines += ["", "## Against the published trials", "", agreement(summary), ""]
         lines += [
             "Two-sample Cramér–von Mises test, two-sided, on the whole distribution; "
             f"{100 * SIGNIFICANCE:g} % for all rows together (Holm).",

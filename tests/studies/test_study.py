@@ -181,4 +181,6 @@ def test_the_thesis_study_holds_every_row_of_its_tables():
     for variant in study.variants.values():
         assert variant.published is not None
         row = PUBLISHED[variant.published]
-        assert variant.overrides.get("guidance.mission.altitude", 10.0) == row.initial_height
+        flown = variant.overrides.get("guidance.mission.altitude", 10.0)
+        # Table 4 says 6 m of one row; section 8.2.2 and its landing times say 10 m.
+        assert flown == (10.0 if row.table == "Table 15" else row.initial_height)

@@ -58,3 +58,11 @@ class Forgetful(Toy):
         columns = super().run(overrides, seed)
         del columns["landing_time_s"]
         return columns
+
+
+class Gentle(Toy):
+    """Knows its touchdown speed too."""
+
+    def run(self, overrides: dict[str, Any], seed: int) -> dict[str, float | int | str | bool]:
+        speed = 0.3 + 0.2 * hashed_uniform(seed, "speed")
+        return super().run(overrides, seed) | {"touchdown_speed_m_s": speed}

@@ -1,0 +1,154 @@
+"""The page of a study: tables, figures and rows of its campaign, for `docs/`.
+
+    python -m studies.pages out/studies/infrared-and-marker [MORE FOLDERS] [--docs docs]
+
+Every folder of a campaign of study NAME leaves `docs/data/NAME.csv` (its rows, rounded) and
+`docs/data/NAME-*.svg`, and fills the block of each page that asks for it,
+``<!-- campaign NAME -->`` to ``<!-- end -->``. The words around the blocks are written by hand.
+"""
+
+import argparse
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from studies import figures
+from studies.campaign import summarise_again
+from studies.published import PUBLISHED
+from studies.report import samples
+from studies.study import Study
+from studies.summary import agreement, rate, scale_of, show, show_rate, with_measures
+
+FAR = 0.5  # m, a landing farther out than this has missed
+DECIMALS = 4  # of the kept rows: 0.1 mm, 0.1 ms
+
+
+def write(folder: Path, docs: Path) -> None:
+    """Write what a campaign has to say into the pages under `docs`."""
+    result = summarise_again(folder)
+    study = result.study
+    table = with_measures(study, result.table)
+    data = docs / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    kept = ["run", "condition", *study.measures.columns()]
+    table[kept].round(DECIMALS).to_csv(data / f"{study.name}.csv", index=False)
+    _draw(study, table, result.summary, data)
+    text = tables(study, table, result.summary)
+    block = re.compile(
+        rf"(<!-- campaign {re.escape(study.name)} -->\n).*?(<!-- end -->)", re.DOTALL
+    )
+    for page in docs.glob("*.md"):
+        old = page.read_text(encoding="utf-8")
+        new = block.sub(lambda match: f"{match[1]}\n{text}\n{match[2]}", old)
+        if new != old:
+            page.write_text(new, encoding="utf-8")
+
+
+def tables(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> str:
+    """The figures and tables of a campaign as Markdown."""
+    counts = [condition["runs"] for condition in summary["conditions"]]
+    many = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
+    lines = [
+        f"{summary['done']} landings, {many} a row (the study asks for {study.runs}); "
+        f"campaign seed {study.seed}. Intervals: 95 %.",
+        "",
+        f"![Landing error by row](data/{study.name}-error.svg)",
+        "",
+    ]
+    lines += (
+        _published(study, summary)
+        if summary["published"]
+        else _distributions(study, table, summary)
+    )
+    return "\n".join(lines)
+
+
+def _published(study: Study, summary: Mapping[str, Any]) -> list[str]:
+    lines = [f"**{agreement(summary)}**", ""]
+    columns = {"error": study.measures.error, "time": study.measures.time}
+    medians = {
+        condition["condition"]: {
+            quantity: condition["statistics"][column]["median"]["value"]
+            for quantity, column in columns.items()
+        }
+        for condition in summary["conditions"]
+    }
+    for quantity, title in (("error", "Landing error"), ("time", "Time to the stopped motors")):
+        unit, scale = ("cm", 100.0) if quantity == "error" else ("s", 1.0)
+        lines += [
+            f"| {title} ({unit}), mean; median | of | thesis | here | p (Holm) | verdict |",
+            "|---|---|---:|---:|---:|---|",
+        ]
+        for row in summary["published"]:
+            if row["quantity"] == quantity:
+                theirs = np.median(getattr(PUBLISHED[row["published"]], quantity)) * scale
+                ours = medians[row["condition"]][quantity] * scale
+                lines.append(
+                    f"| {row['condition']} | {row['table']} "
+                    f"| {row['their_mean'] * scale:.1f}; {theirs:.1f} "
+                    f"| {row['our_mean'] * scale:.1f}; {ours:.1f} | {row['p_adjusted']:.2g} "
+                    f"| {'agrees' if row['agrees'] else '**differs**'} |"
+                )
+        lines.append("")
+    return lines
+
+
+def _distributions(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> list[str]:
+    measures = study.measures
+    _, unit, scale = scale_of(measures.error, summary)
+    lines = [
+        f"| condition | landed | CEP50 ({unit}) | p95 | p99 | farther than {FAR:g} m "
+        "| touchdown (m/s) | time (s) |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for condition in summary["conditions"]:
+        rows = table[table["condition"].eq(condition["condition"])]
+        landed = rows[rows[measures.success].eq(True)]
+        numbers = condition["statistics"]
+        far = rate(int((landed[measures.error] > FAR).sum()), len(landed))
+        cells = [
+            condition["condition"],
+            f"{condition['success']['value'] or 0:.0%} of {condition['runs']}",
+            show(condition["cep50"], scale),
+            show(numbers[measures.error]["p95"], scale),
+            show(numbers[measures.error]["p99"], scale),
+            show_rate(far),
+            show(numbers["touchdown_speed_m_s"]["mean"], 1.0),
+            show(numbers[measures.time]["mean"], 1.0),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def _draw(study: Study, table: pd.DataFrame, summary: Mapping[str, Any], data: Path) -> None:
+    """Box plots of the error, published trials beside them, on white."""
+    column = study.measures.error
+    title, unit, scale = scale_of(column, summary)
+    with figures.style():
+        shown = samples(study, table, column, scale)
+        made = figures.figure(9.4, 0.9 + 0.42 * len(shown))
+        wide = all((sample.values > 0.0).all() and np.size(sample.values) for sample in shown)
+        figures.boxes(made.subplots(), shown, f"{title} ({unit})", logarithmic=wide)
+        made.savefig(
+            data / f"{study.name}-error.svg",
+            facecolor="white",
+            metadata={"Date": None, "Creator": None},
+        )
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description="Write the pages of campaigns.")
+    parser.add_argument("folders", nargs="+", type=Path, help="of campaigns")
+    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    arguments = parser.parse_args()
+    for folder in arguments.folders:
+        write(folder, arguments.docs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+from pathlib import Path
+
+import pandas as pd
+
+from studies import pages
+from studies.campaign import run_study
+from tests.studies.driver import slow_study
+
+RUNS = 24
+PAGE = "# Words\n\n<!-- campaign {} -->\nold\n<!-- end -->\n\nMore words.\n"
+
+
+def test_a_page_gets_the_tables_figures_and_rows_of_its_campaign(tmp_path: Path):
+    study = slow_study()
+    study.measures.others = ["touchdown_speed_m_s"]
+    study.experiment = "tests.studies.toy:Gentle"
+    folder, docs = tmp_path / "campaign", tmp_path / "docs"
+    docs.mkdir()
+    (docs / "mine.md").write_text(PAGE.format("toy"))
+    (docs / "other.md").write_text(PAGE.format("another"))
+    result = run_study(study, folder, RUNS, workers=0, progress=False)
+    pages.write(folder, docs)
+
+    text = (docs / "mine.md").read_text()
+    assert text.startswith("# Words")
+    assert text.endswith("More words.\n")
+    assert "old" not in text
+    assert f"{RUNS} landings, {RUNS // 2} a row" in text
+    for condition in ("narrow", "wide"):
+        assert f"| {condition} | " in text
+    assert (docs / "other.md").read_text() == PAGE.format("another")
+
+    kept = pd.read_csv(docs / "data" / "toy.csv")
+    assert kept["run"].tolist() == list(range(RUNS))
+    pd.testing.assert_series_equal(
+        kept["landing_error_m"], result.table["landing_error_m"], atol=1e-4, check_exact=False
+    )
+    assert (docs / "data" / "toy-error.svg").read_text().count("<svg") == 1
+
+    pages.write(folder, docs)  # the same again
+    assert (docs / "mine.md").read_text() == text
