@@ -30,3 +30,9 @@ if ! "$PYTHON" -m venv "$VENV" 2>/dev/null; then
 fi
 "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check \
     --constraint constraints.txt --editable ".[dev]"
+
+# Machine code for the kernels is kept on disk; one flight makes all that the default scenario needs.
+printf 'plumbline: compiling, once; this takes a minute or two\n'
+first_flight=$(mktemp -d)
+"$VENV/bin/plumbline" land --no-report --out "$first_flight" >/dev/null || [ $? -eq 1 ]
+rm -rf "$first_flight"

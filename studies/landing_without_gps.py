@@ -221,6 +221,10 @@ def equivalent_angular_error(position_error: float, distance: float, slope: floa
 
 
 if __name__ == "__main__":
-    found = read_campaigns(Path(sys.argv[1] if len(sys.argv) > 1 else "out/studies"))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/studies")
+    found = read_campaigns(folder)
+    for reference in ("terrain", "latency-closed"):
+        if reference not in found:
+            sys.exit(f"{folder}: expected the finished campaign {PREFIX}{reference}, a reference")
     secret = calibrate(found)
     print(markdown(predict(found, secret), secret))

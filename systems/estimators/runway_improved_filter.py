@@ -56,7 +56,7 @@ class RunwayImprovedFilterConfig:
     bearing_noise: Positive = 1.2  # px; the tracker's is a pixel
     elevation_noise: Positive = 1.2  # px
     camera_shift: Metres = 0.05  # m, position of the camera
-    picture_correlation: Positive = 40.0  # pictures that tell as much as one of roll and position
+    picture_correlation: Positive = 50.0  # pictures that tell as much as one of roll and position
     antenna_azimuth: NonNegative = 0.5  # deg
     antenna_elevation: NonNegative = 0.3  # deg
     antenna_noise: Positive = 0.25  # deg
