@@ -24,7 +24,8 @@ Ohnishi, Shibata, Murakami, "Motion control for advanced mechatronics", IEEE/ASM
 with c the mean rotor command behind the rotors' lag; d₀ is what the controller's integrator
 already holds against the steady wind. So in the last metre, seen or not, the wind is met by
 what it did a moment ago. The same d tells the ground: when the legs carry, d_z jumps. (It is
-not small before: wind and ground make the rotors lift more.) The rotors stop at once, because
+not small before: wind and ground make the rotors lift more. A pad that rises softly
+from below is noticed because the vehicle does not sink any more.) The rotors stop at once, because
 a vehicle that is light on its legs slides.
 
 A pad that moves is followed with its velocity, vertically too. When the target is lost the
@@ -41,7 +42,7 @@ from pydantic import Field
 
 from systems.configuration import Finite, Metres, NonNegative, Positive, Seconds, configuration
 from systems.schedule import PLANT_PERIOD
-from systems.supervisors.situation import Memory, Situation
+from systems.supervisors.situation import NOT_YET, Memory, Situation
 from systems.supervisors.state_machine import (
     State,
     Transition,
@@ -53,6 +54,8 @@ _GRAVITY = 9.80665  # m/s2
 _NEAR, _FAR = 0.5, 1.0  # m, of error: the position loop is stiffened within, not beyond
 _VERTICAL_GAIN = 1.0  # 1/s, height error to speed
 _CLOSE = 0.12  # m, of the feet above the pad, within which a push from below is the ground
+_AT_PAD = 0.06  # m, of the feet above the pad, at which one foot of a tilted vehicle may stand
+_ORDERED = 0.2  # m/s, rate of descent from which on not to sink means something
 _STILL = 0.15  # m/s, vertical speed that tells the ground where no height is known
 
 
@@ -65,6 +68,7 @@ class ConeMemory(Memory):
     held_ay: float = 0.0
     push: float = math.nan  # m/s2, low-passed vertical disturbance
     thrust: float = math.nan  # 1, rotor command by that of level flight, behind the rotors' lag
+    still_since: float = NOT_YET  # s, at the pad it has not sunk since, though it should
     known: float = 0.0  # 0/1, the pad has been seen
     pad_x: float = math.nan  # m, the pad as last known, carried on with its velocity
     pad_y: float = math.nan
@@ -80,7 +84,7 @@ class ConeMemory(Memory):
 
 S = Situation[ConeMemory]
 
-_WATCH = ("observe_drift", "track_pad")
+_WATCH = ("observe_drift", "track_pad", "watch_sinking")
 
 
 class Cone:
@@ -99,9 +103,8 @@ class Cone:
             State("land_anyway", stay=(*_WATCH, "follow_or_return", "sit_down_there")),
         ),
         transitions=(
-            *transitions_from(
-                ("descend", "settle", "touch", "land_anyway"), "landed", "on_the_ground"
-            ),
+            *transitions_from(("touch", "land_anyway"), "landed", "on_the_ground"),
+            *transitions_from(("descend", "settle"), "landed", "on_the_pad"),
             *transitions_from(
                 ("descend", "settle", "touch", "land_anyway"), "landed", "touched_down"
             ),
@@ -203,7 +206,12 @@ class Cone:
         return self._feet(s) > _CLOSE / 2 and self._distance(s) > 1.5 * c.touch_radius_limit
 
     def on_the_ground(self, s: S) -> bool:
-        """The legs carry."""
+        """The legs carry, or the vehicle does not sink any more."""
+        since = s.memory.still_since
+        return self._struck(s) or (since >= 0.0 and s.time - since >= self.config.still_time)
+
+    def _struck(self, s: S) -> bool:
+        """Something has pushed the vehicle from below just now."""
         if s.memory.setpoint_vz - s.memory.pad_uz >= 0.0 or not math.isnan(s.memory.setpoint_z):
             return False
         jump = self._push(s) - s.memory.push
@@ -214,6 +222,10 @@ class Cone:
         if s.height_measured:
             return s.height + self.config.feet_height < _CLOSE
         return abs(s.vz) < _STILL
+
+    def on_the_pad(self, s: S) -> bool:
+        """The legs carry, where they should: elsewhere it lifts off again."""
+        return self._distance(s) <= self.config.touch_radius_limit and self.on_the_ground(s)
 
     def time_is_up(self, s: S) -> bool:
         """The landing has taken as long as it may."""
@@ -284,6 +296,15 @@ class Cone:
             m.held_ay += share * (drift_y - m.held_ay)
         else:
             m.setpoint_ax, m.setpoint_ay = m.held_ax - m.drift_ax, m.held_ay - m.drift_ay
+
+    def watch_sinking(self, s: S) -> None:
+        """Keep the time since which the vehicle should sink at the pad and does not."""
+        m = s.memory
+        ordered = math.isnan(m.setpoint_z) and m.setpoint_vz - m.pad_uz < -_ORDERED
+        if not (ordered and self._feet(s) < _AT_PAD and s.vz - m.pad_uz > -0.5 * _ORDERED):
+            m.still_since = NOT_YET
+        elif m.still_since < 0.0:
+            m.still_since = s.time
 
     def track_pad(self, s: S) -> None:
         """Remember where the pad is and how it moves; carry it on while it is not seen."""
@@ -430,6 +451,7 @@ class ConeConfig:
     touch_lead: Seconds = 0.3  # s, τ
     touch_speed: Positive = 0.4  # m/s
     contact_push: Positive = 2.5  # m/s2, a jump that no vertical gust makes
+    still_time: Seconds = 0.2  # s, without sinking, after which the pad has been met softly
     push_time: Positive = 0.3  # s, low pass of what it jumps from
     # The wind
     drift_time: Positive = 0.15  # s, low pass of the disturbance

@@ -217,6 +217,28 @@ def test_the_ground_is_felt_and_a_gust_is_not():
     assert not cone.on_the_ground(situation(z=0.01, az=5.0, **climbing))
 
 
+def test_a_soft_touch_is_noticed_after_a_while():
+    cone = Cone(settings())
+    resting = {"z": 0.02, "setpoint_vz": -0.4, "setpoint_z": math.nan, "push": 0.0}
+    s = situation(**resting, time=50.0)
+    cone.watch_sinking(s)
+    assert not cone.on_the_ground(s)
+    s.time += settings().still_time
+    cone.watch_sinking(s)
+    assert cone.on_the_ground(s)
+    s.vz = -0.3
+    cone.watch_sinking(s)
+    assert not cone.on_the_ground(s)
+
+
+def test_ground_that_was_not_meant_is_left_again():
+    cone = Cone(settings())
+    grazing = {"z": 0.01, "az": 5.0, "setpoint_vz": -0.1, "setpoint_z": math.nan, "push": 0.0}
+    assert cone.on_the_pad(situation(**grazing, x=0.05))
+    assert not cone.on_the_pad(situation(**grazing, x=0.2))
+    assert cone.on_the_ground(situation(**grazing, x=0.2))
+
+
 def test_blown_away_goes_back_into_the_cone():
     cone = Cone(settings())
     assert cone.blown_away(situation(z=0.2, x=0.5))
