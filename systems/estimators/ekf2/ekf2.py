@@ -27,7 +27,7 @@ from systems.estimators.ekf2 import filter as kernels
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import messages, parameters
 from systems.estimators.ekf2.world_model import earth_field
-from systems.schedule import CLOCK_PERIOD, PLANT_PERIOD
+from systems.schedule import CLOCK_PERIOD, PLANT_PERIOD, SUPERVISOR_PERIOD
 from systems.signals.measurement import (
     BAROMETER,
     EXTERNAL_VISION,
@@ -42,6 +42,7 @@ _OBSERVATION_DELAYS = tuple(
     f"EKF2_{sensor}_DELAY" for sensor in ("GPS", "BARO", "MAG", "RNG", "EV")
 )
 _CONNECTED = slice(at.CONNECTED, at.CONNECTED + 6)
+_VISION = at.CONNECTED + 4
 VEHICLE_STATUS_SIZE = 3  # at rest, in the air, in ground effect (0/1)
 
 
@@ -151,8 +152,8 @@ class Ekf2(LeafSystem):
     | update | every `period` from 0 | the IMU sample moves the output predictor; a filter step
     follows when the samples make up EKF2_PREDICT_US |
 
-    The other messages are looked at every 20 ms, on the tick after the one that sensors have
-    their events on.
+    The other messages are looked at on the tick after the one that sensors have their events
+    on, every 40 ms, and every 20 ms if external vision is connected.
 
     The discrete state has two groups: the filter's flat array (see `layout`) and `estimate`.
     """
@@ -215,7 +216,11 @@ class Ekf2(LeafSystem):
         self._rate = 1.0 / config.period
         # The laboratory's sensors have their events on this grid; what they measure is there a
         # tick later. Those of a log have times of their own.
-        self._poll = round(CLOCK_PERIOD / PLANT_PERIOD) if config.period == PLANT_PERIOD else 1
+        # Only external vision comes more often than every SUPERVISOR_PERIOD.
+        self._poll = self._seldom = 1
+        if config.period == PLANT_PERIOD:
+            self._poll = round(CLOCK_PERIOD / PLANT_PERIOD)
+            self._seldom = round(SUPERVISOR_PERIOD / PLANT_PERIOD)
         self._parameters = config.parameter_array()
         self._initial = kernels.initialise(self._parameters)
         latitude, longitude, altitude = config.origin
@@ -248,7 +253,9 @@ class Ekf2(LeafSystem):
         estimate = discrete_state.get_mutable_value(1)
         parameters, absent = self._parameters, self._absent
         messages_in = self._nothing
-        if round(context.get_time() * self._rate) % self._poll == self._poll - 1:
+        tick = round(context.get_time() * self._rate)
+        every = self._poll if x.item(_VISION) else self._seldom
+        if tick % every == min(1, every - 1):
             connected = x[_CONNECTED].tolist()
             messages_in = [
                 evaluate(context) if is_connected else absent
