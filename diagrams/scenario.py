@@ -210,6 +210,7 @@ def _shared(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
     if isinstance(s.guidance.routine, ConeConfig):
         feet = min(foot[2] for foot in vehicle.feet)
         shared.append(("guidance.routine.feet_height", feet, "vehicle"))
+    shared += _seen_on_the_pad(s)
     cameras = s.sensors.marker_camera, s.sensors.infrared_camera
     for name, camera in zip(("marker", "infrared"), cameras, strict=True):
         sensor = f"sensors.{name}_camera.sensor"
@@ -232,6 +233,30 @@ def _shared(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
         position = s.sensors.range_finder.position
         front_end = "landing_target.front_end.range_finder_position"
         shared.append((front_end, position, "sensors.range_finder.position"))
+    return shared
+
+
+def _seen_on_the_pad(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
+    """As `_shared`: what the marker and the infrared camera look for."""
+    shared: list[tuple[str, Any, str]] = []
+    if s.sensors.marker_camera is not None:
+        sensor, marker = "sensors.marker_camera.sensor", s.pad.marker
+        if marker is None:
+            raise ValueError(
+                "pad.marker is null, but there is a marker camera: "
+                "set sensors.marker_camera to null"
+            )
+        shared.append((f"{sensor}.marker_ids", marker.ids().tolist(), "pad.marker"))
+        shared.append((f"{sensor}.marker_sides", marker.sides().tolist(), "pad.marker"))
+        shared.append((f"{sensor}.plate_side", s.pad.side, "pad.side"))
+    if s.sensors.infrared_camera is not None:
+        sensor, beacon = "sensors.infrared_camera.sensor", s.pad.beacon
+        if beacon is None:
+            raise ValueError(
+                "pad.beacon is null, but there is an infrared camera: "
+                "set sensors.infrared_camera to null"
+            )
+        shared.append((f"{sensor}.beacon_position", beacon.position, "pad.beacon.position"))
     return shared
 
 

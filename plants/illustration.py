@@ -140,18 +140,17 @@ def _white_runs(marker_id: int) -> Iterable[tuple[int, int, int]]:
 
 def marker_pieces(marker: NestedMarkerConfig) -> list[Piece]:
     """The nested marker in P: every level a black square with white cells on it."""
-    turn = RigidTransform(RotationMatrix.MakeZRotation(marker.yaw))
     pieces = []
     for depth, level in enumerate(marker.levels):
         z = (2 * depth + 0.5) * _RELIEF
         black = Box(level.side, level.side, _RELIEF)
-        pieces.append(Piece(f"level{depth}", black, turn @ _at(0, 0, z), _INK))
+        pieces.append(Piece(f"level{depth}", black, _at(0, 0, z), _INK))
         cell = level.side / MARKER_CELLS
         for k, (row, column, length) in enumerate(_white_runs(level.id)):
             x = (column + 0.5 * length) * cell - 0.5 * level.side
             y = 0.5 * level.side - (row + 0.5) * cell
             white = Box(length * cell, cell, _RELIEF)
-            pose = turn @ _at(x, y, z + _RELIEF)
+            pose = _at(x, y, z + _RELIEF)
             pieces.append(Piece(f"level{depth}_white{k}", white, pose, _BOARD))
     return pieces
 

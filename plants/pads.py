@@ -57,7 +57,6 @@ class NestedMarkerConfig:
         min_length=1,
         max_length=MARKER_LEVELS,
     )
-    yaw: Finite = 0.0  # rad, of the marker on the pad, counter-clockwise
 
     def ids(self) -> np.ndarray:
         """The ids of the levels, shape (levels,)."""
@@ -73,9 +72,8 @@ class NestedMarkerConfig:
         In OpenCV's order: top left, top right, bottom right, bottom left of the
         upright marker.
         """
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
         unit = 0.5 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
-        square = np.column_stack((unit @ np.array([[c, s], [-s, c]]), np.zeros(4)))
+        square = np.column_stack((unit, np.zeros(4)))
         return self.sides()[:, None, None] * square
 
 
@@ -83,10 +81,7 @@ class NestedMarkerConfig:
 class InfraredBeaconConfig:
     """An infrared beacon like the MarkOne: a point that an infrared camera sees from above."""
 
-    position: Vector3 = Field(
-        default_factory=_zeros
-    )  # m, in P; the thesis: inside the inner marker
-    visible_range: Positive = 15.0  # m, IR-LOCK's figure for the MarkOne "in all light"
+    position: Vector3 = Field(default_factory=_zeros)  # m, in P; thesis: inside the inner marker
 
 
 @configuration

@@ -73,6 +73,23 @@ def test_configure_takes_numbers_and_refuses_another_structure(scenario, landing
     landing.configure(scenario)
 
 
+def test_the_cameras_look_for_what_is_on_the_pad(scenario):
+    pad = {
+        "pad.side": 0.9,
+        "pad.marker.levels": [{"id": 3, "side": 0.5}, {"id": 7, "side": 0.1}],
+        "pad.beacon.position": [0.2, 0.0, 0.0],
+    }
+    sensors = settled(with_overrides(scenario, pad)).sensors
+    assert sensors.marker_camera.sensor.marker_ids == [3, 7]
+    assert sensors.marker_camera.sensor.marker_sides == [0.5, 0.1]
+    assert sensors.marker_camera.sensor.plate_side == 0.9
+    assert sensors.infrared_camera.sensor.beacon_position == [0.2, 0.0, 0.0]
+    for part, camera in (("marker", "marker"), ("beacon", "infrared")):
+        with pytest.raises(ValueError, match=f"pad.{part} is null.*{camera}_camera to null"):
+            settled(with_overrides(scenario, {f"pad.{part}": None}))
+        settled(with_overrides(scenario, {f"pad.{part}": None, f"sensors.{camera}_camera": None}))
+
+
 def test_shared_values_reach_their_blocks(scenario):
     iris = settled(with_overrides(scenario, {"vehicle.vehicle": "iris"}))
     assert iris.control.vehicle.rotor_count == 4
