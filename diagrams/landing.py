@@ -157,6 +157,7 @@ class LandingDiagram:
                 ports["external_vision"] = self.target.GetOutputPort("external_vision")
         ports["setpoint"] = self.guidance.GetOutputPort("setpoint")
         ports["supervisor"] = self.guidance.GetOutputPort("status")
+        ports["vehicle_status"] = self.guidance.GetOutputPort("vehicle_status")
         ports["rotor_commands"] = self.control.GetOutputPort("rotor_commands")
         ports["touchdown"] = self.observer.GetOutputPort("touchdown")
         return ports

@@ -7,6 +7,14 @@ from systems.estimators.ekf2.ekf2 import Ekf2Config
 from systems.estimators.ekf2_selector import Ekf2SelectorConfig
 
 IMUS = ("imu", "imu_2", "imu_3")  # inputs of the instances, in their order
+SHARED = (
+    "gnss",
+    "barometer",
+    "magnetometer",
+    "range_finder",
+    "external_vision",
+    "vehicle_status",
+)
 
 
 class RedundantNavigation(Diagram):
@@ -23,6 +31,7 @@ class RedundantNavigation(Diagram):
         - magnetometer (optional)
         - range_finder (optional)
         - external_vision (optional)
+        - vehicle_status (optional)
         output_ports:
         - estimate
         - instance
@@ -37,6 +46,7 @@ class RedundantNavigation(Diagram):
     | `magnetometer` (optional) | `MAGNETOMETER` | unconnected: the heading waits for GNSS |
     | `range_finder` (optional) | `RANGE_FINDER` | unconnected: the ground is where it took off |
     | `external_vision` (optional) | `EXTERNAL_VISION` | unconnected: no vision |
+    | `vehicle_status` (optional) | `VEHICLE_STATUS` | unconnected: in the air |
     | `estimate` | `VEHICLE_ESTIMATE` | of the selected instance, a change being a reset |
     | `instance` | (2,) | its number, and the time (s) of the last change |
 
@@ -63,7 +73,7 @@ class RedundantNavigation(Diagram):
                 builder.Connect(
                     instance.GetOutputPort(output), self.selector.GetInputPort(f"{output}_{i}")
                 )
-        for name in ("gnss", "barometer", "magnetometer", "range_finder", "external_vision"):
+        for name in SHARED:
             shared = builder.ExportInput(self.instances[0].GetInputPort(name), name)
             for instance in self.instances[1:]:
                 builder.ConnectInput(shared, instance.GetInputPort(name))

@@ -297,6 +297,15 @@ SUPERVISOR_STATUS = Layout(
     ),
 )
 
+VEHICLE_STATUS = Layout(
+    "VehicleStatus",
+    (
+        "at_rest",  # 0/1, stands still on the ground
+        "in_air",  # 0/1
+        "in_ground_effect",  # 0/1
+    ),
+)
+
 # The run's verdict, from the true states.
 TOUCHDOWN = Layout(
     "Touchdown",

@@ -28,6 +28,7 @@ from systems.signals.measurement import (
     TIME_OF_ARRIVAL,
     VALID,
     VEHICLE_ESTIMATE,
+    VEHICLE_STATUS,
     no_measurement,
 )
 from systems.signals.optional_input import optional_input
@@ -110,9 +111,11 @@ _P_VARIANCE = slice(
 )
 _RANGE = RANGE_FINDER.index("range")
 _STATUS = SETPOINT.size  # where the status begins in the fields of `Memory`
-_REST = _STATUS + SUPERVISOR_STATUS.size
+_VEHICLE = _STATUS + SUPERVISOR_STATUS.size
+_REST = _VEHICLE + VEHICLE_STATUS.size
 _SETPOINT_NUMBERS = Struct(f"{SETPOINT.size}d")
 _STATUS_NUMBERS = Struct(f"{SUPERVISOR_STATUS.size}d")
+_VEHICLE_NUMBERS = Struct(f"{VEHICLE_STATUS.size}d")
 _AXES = ("_x", "_y", "_z")  # endings of the names of positions
 _NEVER_SEEN = TARGET_ESTIMATE.zeros()
 _NO_RANGE = no_measurement(RANGE_FINDER)
@@ -131,6 +134,7 @@ class LandingSupervisor(LeafSystem):
         output_ports:
         - setpoint
         - status
+        - vehicle_status
 
     | port | layout | meaning |
     |---|---|---|
@@ -142,6 +146,7 @@ the estimate's height above ground, or the height above the place of arming, sta
 unconnected: touchdown is judged by motion alone |
     | `setpoint` | `SETPOINT` | what the controller is asked for |
     | `status` | `SUPERVISOR_STATUS` | the state by its index in `machine.table` |
+    | `vehicle_status` | `VEHICLE_STATUS` | what the land detector tells the navigation filter |
 
     The table `machine.table` (states, guards, actions) is the specification; draw it with
     `state_machine.to_dot`. Over the target, with the reference point C fixed in B,
@@ -173,10 +178,12 @@ unconnected: touchdown is judged by motion alone |
         )
         initial = np.array(self._routine.memory.initial())
         setpoint = self.DeclareDiscreteState(BasicVector(initial[:_STATUS]))
-        status = self.DeclareDiscreteState(BasicVector(initial[_STATUS:_REST]))
+        status = self.DeclareDiscreteState(BasicVector(initial[_STATUS:_VEHICLE]))
+        vehicle = self.DeclareDiscreteState(BasicVector(initial[_VEHICLE:_REST]))
         self.DeclareDiscreteState(BasicVector(initial[_REST:]))
         self.DeclareStateOutputPort("setpoint", setpoint)
         self.DeclareStateOutputPort("status", status)
+        self.DeclareStateOutputPort("vehicle_status", vehicle)
         self.DeclarePeriodicDiscreteUpdateEvent(SUPERVISOR_PERIOD, 0.0, self._update)
 
     def configure(self, config: LandingSupervisorConfig, seed: int = 0) -> None:
@@ -214,10 +221,11 @@ unconnected: touchdown is judged by motion alone |
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         setpoint = discrete_state.get_mutable_value(0)
         status = discrete_state.get_mutable_value(1)
-        rest = discrete_state.get_mutable_value(2)
+        vehicle = discrete_state.get_mutable_value(2)
+        rest = discrete_state.get_mutable_value(3)
         memory = self._routine.memory()
         values = vars(memory)
-        stored = (*setpoint.tolist(), *status.tolist(), *rest.tolist())
+        stored = (*setpoint.tolist(), *status.tolist(), *vehicle.tolist(), *rest.tolist())
         values.update(zip(self._fields, stored, strict=True))
         s: Situation[Any] = Situation(memory, SUPERVISOR_PERIOD)
         s.time = context.get_time()
@@ -235,7 +243,8 @@ unconnected: touchdown is judged by motion alone |
         # A third of the time that numpy takes to make an array of a list.
         numbers = list(values.values())
         _SETPOINT_NUMBERS.pack_into(setpoint, 0, *numbers[:_STATUS])
-        _STATUS_NUMBERS.pack_into(status, 0, *numbers[_STATUS:_REST])
+        _STATUS_NUMBERS.pack_into(status, 0, *numbers[_STATUS:_VEHICLE])
+        _VEHICLE_NUMBERS.pack_into(vehicle, 0, *numbers[_VEHICLE:_REST])
         self._rest.pack_into(rest, 0, *numbers[_REST:])
 
     def _perceive_vehicle(self, context: Context, s: Situation[Any]) -> None:
@@ -293,6 +302,11 @@ unconnected: touchdown is judged by motion alone |
             m.last_fusion = target[_FUSED]
             m.goal_x, m.goal_y, m.goal_z = s.goal_x, s.goal_y, s.goal_z
             m.sighting_x, m.sighting_y, m.sighting_z = s.x, s.y, s.z
+
+
+def remembered(memory: type[Memory]) -> tuple[str, ...]:
+    """The names of what is in the discrete state's last group, behind setpoint and statuses."""
+    return memory.fields()[_REST:]
 
 
 def _shift(m: Memory, names: list[str], jump: float) -> None:

@@ -15,7 +15,7 @@ NOT_YET = -1.0  # s, a time that has not come
 class Memory:
     """The numbers every supervisor keeps; class values are the initial ones.
 
-    The first fields are in the order of the layouts `SETPOINT` and `SUPERVISOR_STATUS`.
+    The first fields are those of the layouts `SETPOINT`, `SUPERVISOR_STATUS`, `VEHICLE_STATUS`.
     """
 
     setpoint_x: float = math.nan  # m
@@ -38,6 +38,10 @@ class Memory:
     target_in_use: float = 0.0
     landed: float = 0.0
     disarmed: float = 1.0
+
+    at_rest: float = 1.0
+    in_air: float = 0.0
+    in_ground_effect: float = 0.0
 
     entered: float = 0.0  # s, when the present state was entered
     horizontal_resets: float = -1.0  # counters of the navigation filter, as last seen

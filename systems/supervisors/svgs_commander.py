@@ -4,15 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydrake.systems.framework import BasicVector, Context
 
-from systems.signals.measurement import SETPOINT, SUPERVISOR_STATUS
-from systems.supervisors.landing_supervisor import LandingSupervisor
+from systems.supervisors.landing_supervisor import LandingSupervisor, remembered
 from systems.supervisors.situation import Situation
 from systems.supervisors.svgs_routine import COMMAND, FEEDBACK, SvgsMemory
 
 if TYPE_CHECKING:
     from systems.supervisors.landing_supervisor import LandingSupervisorConfig
-
-_REST = SETPOINT.size + SUPERVISOR_STATUS.size
 
 
 class SvgsCommander(LandingSupervisor):
@@ -29,6 +26,7 @@ class SvgsCommander(LandingSupervisor):
         output_ports:
         - setpoint
         - status
+        - vehicle_status
         - command
 
     | port | layout | meaning |
@@ -40,6 +38,7 @@ class SvgsCommander(LandingSupervisor):
     | `feedback` | `svgs_routine.FEEDBACK` | whether motion control has finished |
     | `setpoint` | `SETPOINT` | of the mission; during a manoeuvre only `armed` counts |
     | `status` | `SUPERVISOR_STATUS` | the state by its index in `machine.table` |
+    | `vehicle_status` | `VEHICLE_STATUS` | as in `LandingSupervisor` |
     | `command` | `svgs_routine.COMMAND` | the manoeuvre for motion control |
 
     The node `routine_commander_drspider` of "High-altitude precision landing by SVGS" (Drones 8,
@@ -55,14 +54,14 @@ class SvgsCommander(LandingSupervisor):
         """A commander; its configuration's routine must be of the kind `svgs`."""
         super().__init__(config, seed)
         self._feedback = self.DeclareVectorInputPort("feedback", FEEDBACK.size)
-        names = SvgsMemory.fields()[_REST:]
+        names = remembered(SvgsMemory)
         self._command_fields = [names.index(field) for field in COMMAND.fields]
         self.DeclareVectorOutputPort(
             "command", BasicVector(COMMAND.size), self._calc_command, {self.xd_ticket()}
         )
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(2).value()[self._command_fields])
+        output.SetFromVector(context.get_discrete_state(3).value()[self._command_fields])
 
     def _perceive_target(self, context: Context, s: Situation[Any]) -> None:
         super()._perceive_target(context, s)

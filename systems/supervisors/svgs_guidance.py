@@ -28,6 +28,7 @@ class SvgsGuidance(Diagram):
         output_ports:
         - setpoint
         - status
+        - vehicle_status
 
     | port | layout | meaning |
     |---|---|---|
@@ -37,6 +38,7 @@ class SvgsGuidance(Diagram):
     | `rotor_commands` (optional) | one a rotor | a sign of the ground |
     | `setpoint` | `SETPOINT` | what the controller is asked for, at 30 Hz |
     | `status` | `SUPERVISOR_STATUS` | the state by its index in `machine.table` |
+    | `vehicle_status` | `VEHICLE_STATUS` | as in `LandingSupervisor` |
 
     Attributes
     ----------
@@ -67,7 +69,8 @@ class SvgsGuidance(Diagram):
         for name in ("target", "range_finder", "rotor_commands"):
             builder.ExportInput(self.commander.GetInputPort(name), name)
         builder.ExportOutput(self.px4_control.GetOutputPort("setpoint"), "setpoint")
-        builder.ExportOutput(self.commander.GetOutputPort("status"), "status")
+        for name in ("status", "vehicle_status"):
+            builder.ExportOutput(self.commander.GetOutputPort(name), name)
         builder.BuildInto(self)
 
     def configure(self, config: "LandingSupervisorConfig", seed: int = 0) -> None:

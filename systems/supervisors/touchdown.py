@@ -40,6 +40,9 @@ class TouchdownDetector:
 
     It must last `duration`; `slow_factor` times longer where the height is not
     measured, and again where rotor commands are known but not low.
+
+    In the air it is while armed, at rest while not. As in PX4, ground effect is to be expected
+    while it is asked to descend with `minimum_commanded_descent` and hardly moves horizontally.
     """
 
     def __init__(self, config: TouchdownDetectorConfig):
@@ -47,15 +50,18 @@ class TouchdownDetector:
         self.config = config
 
     def observe(self, s: S) -> None:
-        """Keep the time since which contact has been felt."""
+        """Keep the time since which contact has been felt, and what the detector publishes."""
         c, m = self.config, s.memory
         descent = -m.setpoint_vz if math.isnan(m.setpoint_z) else 0.0
+        horizontally_still = math.hypot(s.vx, s.vy) < c.maximum_horizontal_speed
+        m.in_air, m.at_rest = m.armed, 1.0 - m.armed
+        m.in_ground_effect = float(descent >= c.minimum_commanded_descent and horizontally_still)
         felt = (
             m.armed > 0.0
             and descent > 0.0
             and abs(s.vz) < c.maximum_vertical_speed
             and -s.vz < 0.5 * descent
-            and math.hypot(s.vx, s.vy) < c.maximum_horizontal_speed
+            and horizontally_still
             and (s.height < c.maximum_height or not s.height_measured)
             and (descent >= c.minimum_commanded_descent or self.unloaded(s))
         )

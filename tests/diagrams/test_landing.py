@@ -7,7 +7,9 @@ from diagrams.graph import wiring_dot
 from diagrams.landing import LandingDiagram
 from diagrams.loading import load_scenario, with_overrides
 from diagrams.scenario import settled
+from runs.run import Laboratory
 from systems.configuration import StructureChangedError
+from systems.estimators.ekf2.messages import STATUS
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +51,26 @@ def test_every_input_is_connected_but_the_ones_meant_to_be_open(landing):
         for index in range(system.num_input_ports())
         if (system.get_name(), index) not in connected
     ]
-    # Faults come by a command from outside; vision and the land detector are not on board here.
+    # Faults come by a command from outside; vision is not on board here.
     assert set(open_ports) <= {
         ("sensors", "fault_command"),
         ("navigation", "external_vision"),
-        ("navigation", "vehicle_status"),
     }
+
+
+def test_the_navigation_filter_hears_when_it_takes_off(scenario):
+    laboratory = Laboratory(with_overrides(scenario, {"fidelity": "geometric"}))
+    simulator = laboratory.start()
+    ekf2 = laboratory.landing.navigation
+    heard = []
+    for time in (1.0, 20.0):
+        simulator.AdvanceTo(time)
+        status = ekf2.GetOutputPort("status").Eval(
+            ekf2.GetMyContextFromRoot(simulator.get_context())
+        )
+        values = dict(zip(STATUS.fields, status, strict=True))
+        heard.append((values["vehicle_at_rest"], values["in_air"]))
+    assert heard == [(1.0, 0.0), (0.0, 1.0)]
 
 
 def test_the_fault_command_is_an_input_of_the_whole(landing):

@@ -36,6 +36,7 @@ from systems.signals.measurement import (
     MAGNETOMETER,
     RANGE_FINDER,
     VEHICLE_ESTIMATE,
+    VEHICLE_STATUS,
 )
 
 _OBSERVATION_DELAYS = tuple(
@@ -43,7 +44,6 @@ _OBSERVATION_DELAYS = tuple(
 )
 _CONNECTED = slice(at.CONNECTED, at.CONNECTED + 6)
 _VISION = at.CONNECTED + 4
-VEHICLE_STATUS_SIZE = 3  # at rest, in the air, in ground effect (0/1)
 
 
 @configuration
@@ -123,13 +123,13 @@ class Ekf2(LeafSystem):
     | `magnetometer` (optional) | `MAGNETOMETER` | unconnected: the heading waits for GNSS |
     | `range_finder` (optional) | `RANGE_FINDER` | unconnected: the ground is where it took off |
     | `external_vision` (optional) | `EXTERNAL_VISION` | pose in W; unconnected: no vision |
-    | `vehicle_status` (optional) | 3 numbers | at rest, in the air, in ground effect, 0 or 1 |
+    | `vehicle_status` (optional) | `VEHICLE_STATUS` | unconnected: in the air |
     | `estimate` | `VEHICLE_ESTIMATE` | the state now, from the output predictor, in W and B |
     | `delayed_state` | `DELAYED_STATE` | state and variances at the delayed horizon, NED, FRD |
     | `innovations` | `INNOVATIONS` | newest innovation of every source |
     | `status` | `STATUS` | PX4's control and fault flags, biases, reset counters |
 
-    The last three layouts stand in `messages`. Unconnected, `vehicle_status` means in the air.
+    The last three layouts stand in `messages`.
 
     An extended Kalman filter over 24 errors (attitude, velocity, position, biases of
     gyro and accelerometer, earth and body magnetic field, wind, terrain) runs behind
@@ -167,7 +167,7 @@ class Ekf2(LeafSystem):
             self.DeclareVectorInputPort(name, layout.size)
             for name, layout in zip(names, sizes, strict=True)
         ]
-        self._ports.append(self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS_SIZE))
+        self._ports.append(self.DeclareVectorInputPort("vehicle_status", VEHICLE_STATUS.size))
         self._optional = [port.Eval for port in self._ports]
         self._absent = np.empty(0)
         self._nothing = [self._absent] * len(self._ports)

@@ -151,6 +151,24 @@ def test_waits_until_the_estimate_has_been_valid_for_a_while():
     assert int(np.argmax(armed)) == 5 + math.ceil(0.1 / 0.04)
 
 
+@pytest.mark.parametrize(
+    ("state", "memory", "v", "expected"),
+    [
+        ("wait", {"armed": 0.0}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ("climb", {}, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+        ("descend", {"setpoint_vz": -0.5}, (0.0, 0.0, -0.5), (0.0, 1.0, 1.0)),
+        ("descend", {"setpoint_vz": -0.2}, (0.0, 0.0, -0.2), (0.0, 1.0, 0.0)),  # too slowly
+        ("descend", {"setpoint_vz": -0.5}, (2.0, 0.0, -0.5), (0.0, 1.0, 0.0)),  # and sideways
+    ],
+)
+def test_tells_the_navigation_filter_what_the_land_detector_says(state, memory, v, expected):
+    supervisor = LandingSupervisor(config(NormalConfig()))
+    context = in_state(supervisor, state, **memory)
+    event(supervisor, context, 50.0, estimate=estimate(v=v))
+    port = supervisor.GetOutputPort("vehicle_status")
+    np.testing.assert_array_equal(port.Eval(context), expected)
+
+
 def test_over_the_target_the_setpoint_puts_the_reference_point_on_it():
     supervisor = LandingSupervisor(
         LandingSupervisorConfig(routine=ArduPilotConfig(), reference_point=[0.2, 0.1, -0.05])
@@ -254,7 +272,9 @@ def test_jump_of_the_estimate_moves_every_stored_position():
     for t in (50.0, 50.04):  # the second event sees the same counters
         event(supervisor, context, t, estimate=jumped)
     fields = supervisor._routine.memory.fields()
-    groups = [context.get_discrete_state(i).value() for i in range(3)]
+    groups = [
+        context.get_discrete_state(i).value() for i in range(context.num_discrete_state_groups())
+    ]
     memory = dict(zip(fields, np.concatenate(groups), strict=True))
     shift = {"x": 0.5, "y": -0.25, "z": 2.0}
     for name, value in {**stored, "mark_x": 7.0, "mark_y": 8.0}.items():

@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from systems.configuration import StructureChangedError
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import messages
-from systems.estimators.ekf2.ekf2 import VEHICLE_STATUS_SIZE, Ekf2, Ekf2Config
+from systems.estimators.ekf2.ekf2 import Ekf2, Ekf2Config
 from systems.estimators.ekf2.messages import DELAYED_STATE, INNOVATIONS, STATUS
 from systems.frames import (
     attitude_ned_from_world,
@@ -296,7 +296,6 @@ def test_configuration_names_its_mistakes(tmp_path):
     array = config.parameter_array()
     assert array[messages.prm.EKF2_EVP_GATE] == 9.0
     assert array[messages.prm.EKF2_EV_CTRL] == 3.0
-    assert VEHICLE_STATUS_SIZE == 3
 
 
 def test_starts_as_last_configured_and_only_once():
