@@ -4,13 +4,14 @@ import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from diagrams.blocks import Blocks
-from diagrams.navigation import add_navigation
+from diagrams.navigation import RedundantNavigation, add_navigation
 from diagrams.recording import Recording
 from diagrams.scenario import MultirotorLanding, settled
 from diagrams.sensors import sensors
 from diagrams.svgs import RECORDED
 from diagrams.vehicle import world
 from plants.touchdown import REASONS
+from systems.estimators.ekf2_selector import selection_layout
 from systems.schedule import PLANT_PERIOD
 from systems.signals.measurement import (
     BAROMETER,
@@ -148,8 +149,9 @@ class LandingDiagram:
             if self.sensors.HasOutputPort(name):
                 ports[name] = self.sensors.GetOutputPort(name)
         ports["estimate"] = self.navigation.GetOutputPort("estimate")
-        if self.navigation.HasOutputPort("instance"):
-            ports["instance"] = self.navigation.GetOutputPort("instance")
+        if isinstance(self.navigation, RedundantNavigation):
+            for name in ("instance", "selection"):
+                ports[name] = self.navigation.GetOutputPort(name)
         if self.target is not None:
             ports["target_measurement"] = self.target.GetOutputPort("measurement")
             ports["target"] = self.target.GetOutputPort("target")
@@ -208,6 +210,8 @@ class LandingDiagram:
             "range_finder": (RANGE_FINDER, slow),
             "target_measurement": (TARGET_MEASUREMENT, 0.5 * slow),
         }
+        if scenario.selector is not None:
+            ports["selection"] = (selection_layout(scenario.selector.instances), slow)
         if scenario.recording.imu:
             ports["imu"] = (INERTIAL, PLANT_PERIOD)
         for name, (layout, period) in ports.items():

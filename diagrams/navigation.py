@@ -35,6 +35,7 @@ class RedundantNavigation(Diagram):
         output_ports:
         - estimate
         - instance
+        - selection
 
     | port | layout | meaning |
     |---|---|---|
@@ -49,6 +50,7 @@ class RedundantNavigation(Diagram):
     | `vehicle_status` (optional) | `VEHICLE_STATUS` | unconnected: in the air |
     | `estimate` | `VEHICLE_ESTIMATE` | of the selected instance, a change being a reset |
     | `instance` | (2,) | its number, and the time (s) of the last change |
+    | `selection` | `selection_layout` | the selector's ratios, errors and jumps |
 
     Parameters
     ----------
@@ -68,7 +70,8 @@ class RedundantNavigation(Diagram):
         ]
         self.selector = selector.add_to(builder, "selector", seed)
         for i, instance in enumerate(self.instances):
-            builder.ExportInput(instance.GetInputPort("imu"), IMUS[i])
+            imu = builder.ExportInput(instance.GetInputPort("imu"), IMUS[i])
+            builder.ConnectInput(imu, self.selector.GetInputPort(f"imu_{i}"))
             for output in ("estimate", "innovations", "status"):
                 builder.Connect(
                     instance.GetOutputPort(output), self.selector.GetInputPort(f"{output}_{i}")
@@ -77,7 +80,7 @@ class RedundantNavigation(Diagram):
             shared = builder.ExportInput(self.instances[0].GetInputPort(name), name)
             for instance in self.instances[1:]:
                 builder.ConnectInput(shared, instance.GetInputPort(name))
-        for name in ("estimate", "instance"):
+        for name in ("estimate", "instance", "selection"):
             builder.ExportOutput(self.selector.GetOutputPort(name), name)
         builder.BuildInto(self)
 

@@ -7,13 +7,13 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 from bokeh.layouts import column, gridplot
-from bokeh.models import DataRange1d, Label
+from bokeh.models import DataRange1d, Label, Span
 from bokeh.models.layouts import LayoutDOM
 from bokeh.plotting import figure
 
 from diagrams.scenario import MultirotorLanding
 from plants.svgs_beacons import BEACON_NAMES
-from runs.plots import BLUE, INK, ORANGE, PURPLE, RED, SKY, RunPlots, _figure, _finish
+from runs.plots import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, RunPlots, _figure, _finish
 from systems.supervisors.svgs_routine import SvgsRoutineConfig
 from systems.vision.svgs_selection import (
     AMBIGUOUS,
@@ -25,8 +25,8 @@ from systems.vision.svgs_selection import (
     UNCONFIRMED,
 )
 
-# The colours of the paper's Figure 10, dark enough for paper: short, medium, long.
-BEACON_COLOURS = ("#d9a400", "#d5302b", "#2f9e44")
+# The colour code of the paper's Figures 17 to 19: short, medium, long.
+BEACON_COLOURS = ("#2f9e44", "#d5302b", "#15aabf")
 ZONE = 1.0  # m, radius of the expected landing zone in Figures 14 and 15
 # What a frame without a pose is called where `ERRORS` is too long.
 _BRIEF = {
@@ -38,7 +38,9 @@ _BRIEF = {
     UNCONFIRMED: "unconfirmed",
 }
 _POINTS = 3000  # about so many of a line
-_MEASUREMENTS = ("svgs", "target_measurement", "touchdown", "instance")  # every one counts
+_MEASUREMENTS = ("svgs", "target_measurement", "touchdown")  # every one counts
+_INSTANCE_COLOURS = (RED, BLUE, GREEN, PURPLE)
+_AROUND = 3.0  # s, before and after a change of instance
 _NEAR = 4.5  # m, of the landing point: LEDs further away are left out of the landing zone
 _TILT, _TURN = math.radians(22.0), math.radians(35.0)  # of the view in `trajectory`
 
@@ -80,8 +82,8 @@ class SvgsPlots(RunPlots):
         )
         time = [self.along(axis) for axis in range(3)]
         more = [self.handover(), self.alignment()]
-        if self.port("instance") is not None:
-            more.append(self.instances())
+        if self.port("selection") is not None:
+            more += [self.instances(), self.change()]
         return column(plane, *time, *more, sizing_mode="stretch_width")
 
     def _flu(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,10 +182,10 @@ class SvgsPlots(RunPlots):
         for height in np.linspace(0.0, up.max(), 5):
             level = project(corners_f, corners_l, np.full(5, height))
             plot.line(*level, color="#d5d8de", line_width=1)
-            x, y = project(np.array([side]), np.array([-side]), np.array([height]))
+            x, y = project(np.array([-side]), np.array([side]), np.array([height]))
             plot.add_layout(
-                Label(x=float(x[0]), y=float(y[0]), text=f" {height:.0f} m", text_font_size="8pt",
-                      text_color="#8a8f9c")
+                Label(x=float(x[0]), y=float(y[0]), text=f"{height:.0f} m ", text_align="right",
+                      text_font_size="8pt", text_color="#8a8f9c")
             )  # fmt: skip
         for name, track, colour, dash in tracks:
             label = "truth" if name == "body" else name
@@ -295,22 +297,64 @@ class SvgsPlots(RunPlots):
         return float(self.supervisor["time"][there][0]) if there.any() else None
 
     def instances(self) -> figure:
-        """The selected instance of EKF2, and how far its changes move estimate and setpoint."""
-        plot = self._time_figure("Selected EKF2 instance; error of estimate (m)", "")
-        selected = self.port("instance")
-        estimate, setpoint = self.port("estimate"), self.port("setpoint")
-        if selected is not None and estimate is not None and setpoint is not None:
-            plot.step(selected["time"], selected["selected"], mode="after", color=PURPLE,
-                      line_width=2, legend_label="instance")  # fmt: skip
-            known = estimate["horizontal_valid"] > 0.5
-            time = estimate["time"][known]
-            errors = [
-                estimate[f"p_WB_{axis}"][known]
-                - np.interp(time, self.body["time"], self.body[f"p_WB_{axis}"])
-                for axis in "xyz"
-            ]
-            plot.line(time, np.linalg.norm(errors, axis=0), color=SKY, legend_label="error")
-        return self._finish_time(plot)
+        """The combined test ratio of each EKF2 instance, the selected one's drawn thick."""
+        plot = self._time_figure("EKF2 instances: combined test ratio, the selected one thick", "")
+        selection = self.port("selection")
+        if selection is not None:
+            for i, colour in enumerate(_INSTANCE_COLOURS[: self._instances(selection)]):
+                ratio = selection[f"combined_test_ratio_{i}"]
+                label = f"instance {i}"
+                plot.line(selection["time"], ratio, color=colour, alpha=0.7, legend_label=label)
+                chosen = np.where(selection["selected"] == i, ratio, np.nan)
+                plot.line(selection["time"], chosen, color=colour, line_width=3.5,
+                          legend_label=label)  # fmt: skip
+                ill = (selection[f"healthy_{i}"] < 0.5) & (selection["time"] > 15.0)
+                if ill.any():
+                    plot.scatter(selection["time"][ill], np.zeros(ill.sum()), marker="dash",
+                                 angle=math.pi / 2, size=8, color=colour,
+                                 legend_label=f"{label} unhealthy")  # fmt: skip
+        return _legend_aside(self._finish_time(plot), "above")
+
+    @staticmethod
+    def _instances(selection: dict[str, np.ndarray]) -> int:
+        return sum(name.startswith("combined_test_ratio_") for name in selection)
+
+    def change(self) -> figure:
+        """Estimate, setpoint and vehicle around the change of instance that jumps farthest."""
+        selection = super().port("selection")
+        assert selection is not None
+        flying = np.interp(selection["time"], self.body["time"], self.body["p_WB_z"]) > 1.0
+        changed = np.flatnonzero((np.diff(selection["changes"], prepend=0.0) > 0.0) & flying)
+        if len(changed) == 0:
+            return _finish(_figure("No change of instance in flight", "time (s)", "m", height=220))
+        jumps = np.array(
+            [self._flu(selection["position_jump_x"][k], selection["position_jump_y"][k])
+             for k in changed]
+        )  # fmt: skip
+        worst = int(np.argmax(np.abs(jumps).max(axis=1)))
+        axis = int(np.argmax(np.abs(jumps[worst])))
+        time = float(selection["changed"][changed[worst]])
+        before = int(selection["selected"][changed[worst] - 1])
+        after = int(selection["selected"][changed[worst]])
+        plot = _figure(
+            f"Instance {before} hands over to {after} at {time:.1f} s",
+            "time (s)",
+            f"{('forward', 'left')[axis]} (m)",
+            height=300,
+        )
+        for name, colour, dash, label in (
+            ("setpoint", ORANGE, "dotted", "setpoint"),
+            ("estimate", SKY, "solid", "estimate"),
+            ("body", BLUE, "solid", "truth"),
+        ):
+            samples = super().port(name)
+            if samples is None:
+                continue
+            near = np.abs(samples["time"] - time) <= _AROUND
+            plot.line(samples["time"][near], self._track(samples)[axis][near], color=colour,
+                      line_dash=dash, line_width=2, legend_label=label)  # fmt: skip
+        plot.add_layout(Span(location=time, dimension="height", line_color=INK, line_dash="dashed"))
+        return _legend_aside(_finish(plot), "right")
 
 
 def _legend_aside(plot: figure, place: Literal["right", "above"]) -> figure:

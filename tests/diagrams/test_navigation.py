@@ -54,7 +54,7 @@ def test_one_filter_cannot_become_three():
 @pytest.mark.slow
 def test_a_change_of_instance_moves_setpoint_and_estimate_but_not_the_vehicle():
     # The low flight is short, so the sensor gets worse faster.
-    worse = {**LOW, "sensors.imu.accelerometer_bias_walk": 0.05}
+    worse = {**LOW, "sensors.imu.accelerometer_bias_walk": 0.03}
     laboratory = Laboratory(load_scenario("svgs-three-imus", worse))
     simulator = laboratory.start()
     result = laboratory.fly(simulator)

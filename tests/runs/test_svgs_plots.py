@@ -5,8 +5,10 @@ import pytest
 from bokeh.plotting import figure
 
 from diagrams.loading import load_scenario
+from runs.plots import RunPlots
 from runs.run import Laboratory
 from runs.svgs_plots import BEACON_COLOURS, SvgsPlots
+from systems.estimators.ekf2_selector import selection_layout
 
 YAW = 0.7
 
@@ -65,3 +67,43 @@ def test_distance_shrinks_in_the_alignment(plots: SvgsPlots):
     distance = line.data_source.data["y"]
     assert distance[0] > 1.0
     assert distance[-1] < 0.5 * distance[0]
+
+
+@pytest.fixture
+def selection(plots: SvgsPlots, monkeypatch) -> dict[str, np.ndarray]:
+    """Instance 0 hands over to 2 at 30 s, on the left; instance 0 is ill from then on."""
+    time = plots.body["time"]
+    after = time >= 30.0
+    samples = {name: np.zeros_like(time) for name in ("time", *selection_layout(3).fields)}
+    samples["time"], samples["selected"], samples["changes"] = time, 2.0 * after, 1.0 * after
+    samples["changed"] = 30.0 * after
+    samples["position_jump_x"] = -0.4 * np.sin(YAW) * after
+    samples["position_jump_y"] = 0.4 * np.cos(YAW) * after
+    for i in range(3):
+        samples[f"combined_test_ratio_{i}"] = np.full_like(time, 0.1 * (i + 1))
+        samples[f"healthy_{i}"] = 1.0 - after if i == 0 else np.ones_like(time)
+    port = RunPlots.port
+    monkeypatch.setattr(
+        RunPlots, "port", lambda self, name: samples if name == "selection" else port(self, name)
+    )
+    return samples
+
+
+def test_a_change_of_instance_is_drawn(plots: SvgsPlots, selection: dict[str, np.ndarray]):
+    titles = [plot.title.text for plot in plots.layout().select({"type": figure})]
+    assert "Instance 0 hands over to 2 at 30.0 s" in titles
+    change = plots.change()
+    assert change.yaxis[0].axis_label == "left (m)"
+    (truth,) = renderers(change)["truth"]
+    np.testing.assert_allclose(truth.data_source.data["x"][[0, -1]], [27.0, 33.0], atol=0.1)
+    drawn = renderers(plots.instances())
+    assert set(drawn) == {"instance 0", "instance 0 unhealthy", "instance 1", "instance 2"}
+    _, chosen = drawn["instance 2"]
+    np.testing.assert_array_equal(
+        np.isfinite(chosen.data_source.data["y"]), selection["selected"] == 2.0
+    )
+
+
+def test_no_change_in_flight(plots: SvgsPlots, selection: dict[str, np.ndarray]):
+    selection["changes"][:] = 0.0
+    assert plots.change().title.text == "No change of instance in flight"
