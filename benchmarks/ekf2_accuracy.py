@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from runs.log_sources import FlightLog, read_log
+from runs.flight_log import FlightLog
+from runs.log_sources import read_log
 from runs.replay import (
     AID_COLUMNS,
     DELAYED_COLUMNS,

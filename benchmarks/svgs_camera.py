@@ -22,8 +22,9 @@ from systems.schedule import CLOCK_PERIOD
 from systems.sensors.svgs_camera import SvgsCamera, SvgsCameraConfig
 from systems.signals.measurement import BODY_STATE, SVGS
 from systems.vision.pinhole import pixel_of_tangents
+from systems.vision.planar_pose import quaternion_from_matrix
 from systems.vision.svgs_blobs import centroid_noise
-from systems.vision.svgs_pose import cramer_rao, quaternion_of
+from systems.vision.svgs_pose import cramer_rao
 
 Fidelity = Literal["pixels", "geometric"]
 VARIANTS: tuple[Literal["published", "robust"], ...] = ("published", "robust")
@@ -132,7 +133,7 @@ def fly(config: SvgsCameraConfig, height: float, frames: int, seed: int = 1) -> 
         reach = config.beacons.beacons()[beacon]
         peak = 60.0 * (reach.margin * reach.operating_range / np.linalg.norm(true)) ** 2
         noise = centroid_noise(peak) / config.focal_length
-        pose = np.concatenate([true, quaternion_of(R_CT)])
+        pose = np.concatenate([true, quaternion_from_matrix(R_CT)])
         bound = cramer_rao(reach.led_positions(), pose, noise)
         result.bounds.append(np.sqrt(np.diag(bound)[:3]))
     return result

@@ -96,9 +96,7 @@ class MultirotorConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "Multirotor":
         """Add the system to `builder` under `name`."""
-        system = Multirotor(self, seed)
-        builder.AddNamedSystem(name, system)
-        return system
+        return builder.AddNamedSystem(name, Multirotor(self, seed))
 
 
 class Multirotor(LeafSystem):
@@ -127,7 +125,7 @@ class Multirotor(LeafSystem):
     thrust is linear in it. The equations are in `plants.multirotor_dynamics`.
     Body frame B has its origin at the centre of mass.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | initialize | at the start | the initial state of the last `configure` |
     | step | every 10 ms from 0 | RK4 from t to t + 10 ms with the inputs at t |

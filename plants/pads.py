@@ -132,9 +132,7 @@ class PadConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "Pad":
         """Add the system to `builder` under `name`."""
-        system = Pad(self, seed)
-        builder.AddNamedSystem(name, system)
-        return system
+        return builder.AddNamedSystem(name, Pad(self, seed))
 
 
 class Pad(LeafSystem):

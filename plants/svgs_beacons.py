@@ -27,17 +27,8 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "white": (1.00, 1.00, 0.90),
 }
 
-# Columns of the array of lamps that a camera sees.
-(
-    LAMP_X,  # m, in P
-    LAMP_Y,
-    LAMP_Z,
-    LAMP_RED,
-    LAMP_GREEN,
-    LAMP_BLUE,
-    LAMP_RANGE,  # m, at which it is just bright enough
-    LAMP_RADIUS,  # m
-) = range(8)
+# A lamp as a camera sees it: position (m, in P), light in red, green and blue, the range at which
+# it is just bright enough (m), radius (m).
 LAMP_SIZE = 8
 
 Colour = Literal["green", "red", "yellow", "white"]

@@ -84,9 +84,7 @@ class TouchdownConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "TouchdownObserver":
         """Add the system to `builder` under `name`."""
-        system = TouchdownObserver(self, seed)
-        builder.AddNamedSystem(name, system)
-        return system
+        return builder.AddNamedSystem(name, TouchdownObserver(self, seed))
 
 
 class TouchdownObserver(LeafSystem):
@@ -113,13 +111,13 @@ class TouchdownObserver(LeafSystem):
 
     A touchdown is the first contact after the feet were `airborne_height` up;
     going up again cancels it. Speeds are relative to the surface, from the last
-    look without contact (at most 20 ms before); the vertical one is carried on to
+    look without contact (at most 40 ms before); the vertical one is carried on to
     where the feet meet the surface. Time, speeds and tilt are those of first
     contact, the offset is the last seen: at rest where the run ends so.
     A vehicle that says it is disarmed, with stopped rotors above
     `airborne_height`, has crashed.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | look | every 40 ms from 0 | one application of the rules to the states at t |
     | finish | every 160 ms from 0 (publish) | ends the simulation once there is a verdict |

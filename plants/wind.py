@@ -64,9 +64,7 @@ class WindConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "Wind":
         """Add the system to `builder` under `name`."""
-        system = Wind(self, seed)
-        builder.AddNamedSystem(name, system)
-        return system
+        return builder.AddNamedSystem(name, Wind(self, seed))
 
 
 class Wind(LeafSystem):
@@ -90,7 +88,7 @@ class Wind(LeafSystem):
     (equations in `plants.wind_dynamics`), and gusts v/2 (1 − cos 2π(t − t₀)/T)
     by appointment (the form of CS-25.341). The ground is at z = 0.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 0 | the wind for t + 40 ms, held from t on |
     """

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runs.log_sources import FlightLog, ReplayError
+from runs.flight_log import FlightLog, ReplayError
 from systems.estimators.ekf2 import compiled, parameters
 from systems.estimators.ekf2 import filter as kernels
 from systems.estimators.ekf2 import layout as at

@@ -15,7 +15,7 @@ from plants.illustration import draw, move
 from runs.logs import port_samples
 from systems.signals.measurement import BODY_STATE, PAD_STATE
 
-FRAME_RATE = 31.25  # 1/s, that of the log
+_LIVE_PERIOD = 0.04  # s of simulated time between two poses of the live view
 _TRACK = Rgba(0.0, 0.45, 0.70, 1.0)
 _PATH = "/plumbline"
 
@@ -42,9 +42,11 @@ def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
     track = body[::4, BODY_STATE.slice("p_WB")].T
     scene.SetLine(f"{_PATH}/track", np.asfortranarray(track), 2.0, _TRACK)
     move(scene, body[0], pad[0])
-    scene.StartRecording(FRAME_RATE, set_visualizations_while_recording=False)
+    period = scenario.recording.period
+    scene.StartRecording(1.0 / period, set_visualizations_while_recording=False)
     for frame in range(len(body)):
-        move(scene, body[frame], pad[frame], frame / FRAME_RATE)
+        # half a frame later, because Meshcat rounds down
+        move(scene, body[frame], pad[frame], (frame + 0.5) * period)
     scene.StopRecording()
     scene.PublishRecording()
     page = scene.StaticHtml()
@@ -64,7 +66,7 @@ def live_view(landing: LandingDiagram, scenario: MultirotorLanding) -> Callable:
     def show(context: Context) -> EventStatus:
         nonlocal shown
         time = context.get_time()
-        if time >= shown + 1.0 / FRAME_RATE:
+        if time >= shown + _LIVE_PERIOD:
             shown = time
             move(scene, landing.evaluate("body", context), landing.evaluate("pad", context))
         return EventStatus.DidNothing()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runs.log_sources import FlightLog
+from runs.flight_log import FlightLog
 from runs.replay import Replay, gnss_delay
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2 import parameters as prm

@@ -12,7 +12,7 @@ from bokeh.models.layouts import LayoutDOM
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
-from runs.log_sources import FlightLog
+from runs.flight_log import FlightLog
 from runs.plots import BLUE, GREEN, HEIGHT, ORANGE, PURPLE, RED, SKY, _band, _figure, _finish
 from runs.replay import OUTPUT_COLUMNS, Replay
 from runs.replay_diagnosis import GATES, diagnosis, horizon, source_rows, summaries

@@ -7,7 +7,8 @@ from typing import Literal
 
 from rich.progress import Progress
 
-from runs.log_sources import ReplayError, read_log
+from runs.flight_log import ReplayError
+from runs.log_sources import read_log
 from runs.replay import parameter_array, parameter_values, play
 from runs.replay_diagnosis import diagnosis
 from runs.replay_report import sweep_sentences, write_replay_report

@@ -26,7 +26,7 @@ from functools import partial
 
 import numpy as np
 
-from runs.log_sources import FlightLog, ReplayError
+from runs.flight_log import FlightLog, ReplayError
 from runs.replay import parameter_array, play
 from runs.replay_diagnosis import source_rows
 from systems.estimators.ekf2.parameters import Defaults, Value, checked

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
-from runs.log_sources import FlightLog
+from runs.flight_log import FlightLog
 from runs.replay import AID_COLUMNS, DELAYED_COLUMNS, OUTPUT_COLUMNS, Replay
 from runs.ulog import write_ulog
 from systems.estimators.ekf2 import layout as at

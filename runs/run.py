@@ -21,7 +21,7 @@ from runs.logs import log_table
 from systems.configuration import StructureChangedError
 from systems.signals.measurement import SUPERVISOR_STATUS, TOUCHDOWN
 
-CHUNK = 0.512  # s of simulated time between two looks at the progress
+CHUNK = 0.64  # s of simulated time between two looks at the progress, on the grid of all events
 
 Progress = Callable[[Context], None]
 
@@ -150,7 +150,7 @@ class Laboratory:
         simulator : Simulator, optional
             From `start` or `resume`; a fresh one if not given.
         progress : callable, optional
-            Called with the root context about every half simulated second.
+            Called with the root context every `CHUNK` of simulated time.
         """
         simulator = simulator or self.start()
         context = simulator.get_context()

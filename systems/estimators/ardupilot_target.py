@@ -3,25 +3,13 @@
 from typing import Annotated, Literal
 
 from pydantic import Field
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    Diagram,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import DiagramBuilder
 
 from systems.configuration import Positive, Seconds, configuration
 from systems.estimators import ardupilot_target_kernel as kernel
 from systems.estimators.ardupilot_target_kernel import MEMORY, PARAMETERS
-from systems.estimators.fused_sensor import (
-    POLL_PERIOD,
-    FusedSensorConfig,
-    build_target_estimator,
-    no_target,
-)
-from systems.signals.measurement import TARGET_MEASUREMENT, VEHICLE_ESTIMATE
+from systems.estimators.fused_sensor import POLL_PERIOD, FusedSensorConfig
+from systems.estimators.target_estimator import TargetEstimator, TargetFilter
 
 
 @configuration
@@ -41,50 +29,13 @@ class ArduPilotTargetConfig:
     lost_time: Seconds = 2.0  # s without fusion
     moving_target: bool = False  # PLND_OPTIONS bit 0, report the pad's velocity
 
-    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "ArduPilotTarget":
+    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> TargetEstimator:
         """Add an estimator called `name` to `builder`."""
-        estimator = ArduPilotTarget(self, seed)
-        builder.AddNamedSystem(name, estimator)
-        return estimator
+        estimator = TargetEstimator(ArduPilotTargetFilter(self, seed), self, seed)
+        return builder.AddNamedSystem(name, estimator)
 
 
-class ArduPilotTarget(Diagram):
-    """The fused sensor front end, then ArduPilot's filter.
-
-    .. pydrake_system::
-        name: ArduPilotTarget
-        input_ports:
-        - infrared (optional)
-        - marker (optional)
-        - range_finder (optional)
-        - estimate
-        output_ports:
-        - target
-        - measurement
-
-    | port | layout | meaning |
-    |---|---|---|
-    | `infrared` (optional) | `INFRARED` | as in `FusedSensor` |
-    | `marker` (optional) | `MARKER` | as in `FusedSensor` |
-    | `range_finder` (optional) | `RANGE_FINDER` | as in `FusedSensor` |
-    | `estimate` | `VEHICLE_ESTIMATE` | the vehicle as its navigation filter knows it |
-    | `target` | `TARGET_ESTIMATE` | the landing target |
-    | `measurement` | `TARGET_MEASUREMENT` | what the front end gave the filter |
-    """
-
-    def __init__(self, config: ArduPilotTargetConfig, seed: int = 0):
-        """An estimator; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self._filter = ArduPilotTargetFilter(config, seed)
-        self._front_end = build_target_estimator(self, config.front_end, self._filter, seed)
-
-    def configure(self, config: ArduPilotTargetConfig, seed: int = 0) -> None:
-        """Take over a new configuration; every field may change."""
-        self._filter.configure(config, seed)
-        self._front_end.configure(config.front_end, seed)
-
-
-class ArduPilotTargetFilter(LeafSystem):
+class ArduPilotTargetFilter(TargetFilter):
     """Two filters of relative position and velocity, east and north, as in `AC_PrecLand`.
 
     .. pydrake_system::
@@ -122,18 +73,8 @@ class ArduPilotTargetFilter(LeafSystem):
     | update | every 20 ms from 0 | predict, take a new measurement, predict to now |
     """
 
-    def __init__(self, config: ArduPilotTargetConfig, seed: int = 0):
-        """A filter; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self.configure(config, seed)
-        self._measurement = self.DeclareVectorInputPort("measurement", TARGET_MEASUREMENT.size).Eval
-        self._estimate = self.DeclareVectorInputPort("estimate", VEHICLE_ESTIMATE.size).Eval
-        memory = MEMORY(MEMORY.zeros())
-        memory.last_arrival = -1.0
-        target = self.DeclareDiscreteState(BasicVector(no_target()))
-        self.DeclareDiscreteState(BasicVector(memory[:]))
-        self.DeclareStateOutputPort("target", target)
-        self.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, self._update)
+    memory = MEMORY
+    step = staticmethod(kernel.step)
 
     def configure(self, config: ArduPilotTargetConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""
@@ -150,13 +91,3 @@ class ArduPilotTargetFilter(LeafSystem):
         parameters.moving_target = config.moving_target
         parameters.period = POLL_PERIOD
         self._parameters = parameters[:]
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        kernel.step(
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            context.get_time(),
-            self._measurement(context),
-            self._estimate(context),
-            self._parameters,
-        )

@@ -29,7 +29,7 @@ PARAMETERS = Layout(
         "period",  # s
     ),
 )
-FRAMES = 16  # 0.25 s
+FRAMES = 16  # 0.32 s of 20 ms; the longest lag is 0.25 s
 _FRAME = 5  # delta velocity E, N; velocity E, N; velocity valid
 MEMORY = Layout(
     "ArduPilotTargetMemory",

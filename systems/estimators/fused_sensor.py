@@ -7,7 +7,6 @@ from pydantic import Field
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    Diagram,
     DiagramBuilder,
     DiscreteValues,
     LeafSystem,
@@ -70,9 +69,7 @@ class FusedSensorConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "FusedSensor":
         """Add a front end called `name` to `builder`."""
-        sensor = FusedSensor(self, seed)
-        builder.AddNamedSystem(name, sensor)
-        return sensor
+        return builder.AddNamedSystem(name, FusedSensor(self, seed))
 
 
 class FusedSensor(LeafSystem):
@@ -165,27 +162,6 @@ or old: the estimate's height above ground, and without one infrared alone gives
             self._X_BI,
             self._X_BM,
         )
-
-
-def build_target_estimator(
-    diagram: Diagram, front_end: FusedSensorConfig, target_filter: LeafSystem, seed: int
-) -> FusedSensor:
-    """Make `diagram` a front end followed by `target_filter`, with the common ports.
-
-    The inputs are `infrared`, `marker`, `range_finder` and `estimate`, the outputs `target` and
-    `measurement`. Returns the front end.
-    """
-    builder = DiagramBuilder()
-    sensor = front_end.add_to(builder, "front_end", seed)
-    builder.AddNamedSystem("filter", target_filter)
-    builder.Connect(sensor.GetOutputPort("measurement"), target_filter.GetInputPort("measurement"))
-    for name in ("infrared", "marker", "range_finder", "estimate"):
-        builder.ExportInput(sensor.GetInputPort(name), name)
-    builder.ConnectInput("estimate", target_filter.GetInputPort("estimate"))
-    builder.ExportOutput(target_filter.GetOutputPort("target"), "target")
-    builder.ExportOutput(sensor.GetOutputPort("measurement"), "measurement")
-    builder.BuildInto(diagram)
-    return sensor
 
 
 def no_target() -> np.ndarray:

@@ -35,7 +35,7 @@ PARAMETERS = Layout(
         "range_finder_z",
     ),
 )
-ATTITUDES = 17  # polls that are remembered, 0.256 s
+ATTITUDES = 17  # polls that are remembered: 0.32 s and now
 MEMORY = Layout(
     "FusedSensorMemory",
     (

@@ -1,34 +1,20 @@
 """PX4's two landing-target estimators behind the fused sensor front end."""
 
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 from pydantic import Field
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    Diagram,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import DiagramBuilder
 
 from systems.configuration import Metres, NonNegative, Positive, Seconds, configuration
 from systems.estimators import px4_target_kernel as kernel
-from systems.estimators.fused_sensor import (
-    POLL_PERIOD,
-    FusedSensorConfig,
-    build_target_estimator,
-    no_target,
-)
+from systems.estimators.fused_sensor import POLL_PERIOD, FusedSensorConfig
 from systems.estimators.px4_target_kernel import (
     MEMORY,
     PARAMETERS,
     VISION_MEMORY,
     VISION_PARAMETERS,
 )
-from systems.signals.measurement import TARGET_MEASUREMENT, VEHICLE_ESTIMATE
+from systems.estimators.target_estimator import TargetEstimator, TargetFilter
 
 
 @configuration
@@ -44,50 +30,13 @@ class PX4TargetConfig:
     gate: Positive = 3.84  # on the NIS of each axis, 5 % false alarms
     lost_time: Seconds = 2.0  # s without fusion
 
-    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "PX4Target":
+    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> TargetEstimator:
         """Add an estimator called `name` to `builder`."""
-        estimator = PX4Target(self, seed)
-        builder.AddNamedSystem(name, estimator)
-        return estimator
+        estimator = TargetEstimator(PX4TargetFilter(self, seed), self, seed)
+        return builder.AddNamedSystem(name, estimator)
 
 
-class PX4Target(Diagram):
-    """The fused sensor front end, then PX4's `landing_target_estimator`.
-
-    .. pydrake_system::
-        name: PX4Target
-        input_ports:
-        - infrared (optional)
-        - marker (optional)
-        - range_finder (optional)
-        - estimate
-        output_ports:
-        - target
-        - measurement
-
-    | port | layout | meaning |
-    |---|---|---|
-    | `infrared` (optional) | `INFRARED` | as in `FusedSensor` |
-    | `marker` (optional) | `MARKER` | as in `FusedSensor` |
-    | `range_finder` (optional) | `RANGE_FINDER` | as in `FusedSensor` |
-    | `estimate` | `VEHICLE_ESTIMATE` | the vehicle as its navigation filter knows it |
-    | `target` | `TARGET_ESTIMATE` | the landing target |
-    | `measurement` | `TARGET_MEASUREMENT` | what the front end gave the filter |
-    """
-
-    def __init__(self, config: PX4TargetConfig, seed: int = 0):
-        """An estimator; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self._filter = PX4TargetFilter(config, seed)
-        self._front_end = build_target_estimator(self, config.front_end, self._filter, seed)
-
-    def configure(self, config: PX4TargetConfig, seed: int = 0) -> None:
-        """Take over a new configuration; every field may change."""
-        self._filter.configure(config, seed)
-        self._front_end.configure(config.front_end, seed)
-
-
-class PX4TargetFilter(LeafSystem):
+class PX4TargetFilter(TargetFilter):
     """Two independent filters of relative position and velocity, east and north.
 
     .. pydrake_system::
@@ -122,13 +71,8 @@ class PX4TargetFilter(LeafSystem):
     | update | every 20 ms from 0 | predict, take a new measurement |
     """
 
-    def __init__(self, config: PX4TargetConfig, seed: int = 0):
-        """A filter; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self.configure(config, seed)
-        memory = MEMORY.zeros()
-        memory[MEMORY.index("last_arrival")] = -1.0
-        self._measurement, self._estimate = _declare(self, memory, self._update)
+    memory = MEMORY
+    step = staticmethod(kernel.step)
 
     def configure(self, config: PX4TargetConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""
@@ -142,16 +86,6 @@ class PX4TargetFilter(LeafSystem):
         parameters.lost_time = config.lost_time
         parameters.period = POLL_PERIOD
         self._parameters = parameters[:]
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        kernel.step(
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            context.get_time(),
-            self._measurement(context),
-            self._estimate(context),
-            self._parameters,
-        )
 
 
 @configuration
@@ -170,50 +104,13 @@ class PX4VisionTargetConfig:
     lost_time: Seconds = 2.0  # s without fusion, VTE_TGT_TOUT
     stop_time: Seconds = 3.0  # s without fusion before starting anew, VTE_BTOUT
 
-    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "PX4VisionTarget":
+    def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> TargetEstimator:
         """Add an estimator called `name` to `builder`."""
-        estimator = PX4VisionTarget(self, seed)
-        builder.AddNamedSystem(name, estimator)
-        return estimator
+        estimator = TargetEstimator(PX4VisionTargetFilter(self, seed), self, seed)
+        return builder.AddNamedSystem(name, estimator)
 
 
-class PX4VisionTarget(Diagram):
-    """The fused sensor front end, then PX4's `vision_target_estimator`.
-
-    .. pydrake_system::
-        name: PX4VisionTarget
-        input_ports:
-        - infrared (optional)
-        - marker (optional)
-        - range_finder (optional)
-        - estimate
-        output_ports:
-        - target
-        - measurement
-
-    | port | layout | meaning |
-    |---|---|---|
-    | `infrared` (optional) | `INFRARED` | as in `FusedSensor` |
-    | `marker` (optional) | `MARKER` | as in `FusedSensor` |
-    | `range_finder` (optional) | `RANGE_FINDER` | as in `FusedSensor` |
-    | `estimate` | `VEHICLE_ESTIMATE` | the vehicle as its navigation filter knows it |
-    | `target` | `TARGET_ESTIMATE` | the landing target |
-    | `measurement` | `TARGET_MEASUREMENT` | what the front end gave the filter |
-    """
-
-    def __init__(self, config: PX4VisionTargetConfig, seed: int = 0):
-        """An estimator; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self._filter = PX4VisionTargetFilter(config, seed)
-        self._front_end = build_target_estimator(self, config.front_end, self._filter, seed)
-
-    def configure(self, config: PX4VisionTargetConfig, seed: int = 0) -> None:
-        """Take over a new configuration; every field may change."""
-        self._filter.configure(config, seed)
-        self._front_end.configure(config.front_end, seed)
-
-
-class PX4VisionTargetFilter(LeafSystem):
+class PX4VisionTargetFilter(TargetFilter):
     """Three filters of relative position, vehicle velocity and bias, with late measurements.
 
     .. pydrake_system::
@@ -231,7 +128,7 @@ class PX4VisionTargetFilter(LeafSystem):
     | `target` | `TARGET_ESTIMATE` | the target now; not acquired: the last values |
 
     State r, v, b of each axis with r' = −v, v' = a_WB + white noise, b' = white noise. The position
-    z = r is fused at its time of validity: the newest of 32 snapshots (0.5 s) before it is
+    z = r is fused at its time of validity: the newest of 32 snapshots (0.64 s) before it is
     predicted to that time and corrected by the gain k; every later snapshot and the present
     are corrected by Φ k, Φ being the transition to them, as if nothing had been fused between.
     NIS above `gate` rejects an axis; all three must fuse for the measurement to count.
@@ -249,13 +146,8 @@ class PX4VisionTargetFilter(LeafSystem):
     | update | every 20 ms from 0 | predict, take a new measurement, keep a snapshot |
     """
 
-    def __init__(self, config: PX4VisionTargetConfig, seed: int = 0):
-        """A filter; it draws no random numbers, `seed` is for uniformity."""
-        super().__init__()
-        self.configure(config, seed)
-        memory = VISION_MEMORY.zeros()
-        memory[VISION_MEMORY.index("last_arrival")] = -1.0
-        self._measurement, self._estimate = _declare(self, memory, self._update)
+    memory = VISION_MEMORY
+    step = staticmethod(kernel.vision_step)
 
     def configure(self, config: PX4VisionTargetConfig, seed: int = 0) -> None:
         """Take over a new configuration; every field may change."""
@@ -272,26 +164,3 @@ class PX4VisionTargetFilter(LeafSystem):
         parameters.stop_time = config.stop_time
         parameters.period = POLL_PERIOD
         self._parameters = parameters[:]
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        kernel.vision_step(
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            context.get_time(),
-            self._measurement(context),
-            self._estimate(context),
-            self._parameters,
-        )
-
-
-def _declare(
-    system: PX4TargetFilter | PX4VisionTargetFilter, memory: np.ndarray, update: Callable[..., Any]
-) -> tuple[Callable[[Context], np.ndarray], Callable[[Context], np.ndarray]]:
-    """Declare the ports, state and event that both filters have; returns how to read the inputs."""
-    measurement = system.DeclareVectorInputPort("measurement", TARGET_MEASUREMENT.size)
-    estimate = system.DeclareVectorInputPort("estimate", VEHICLE_ESTIMATE.size)
-    target = system.DeclareDiscreteState(BasicVector(no_target()))
-    system.DeclareDiscreteState(BasicVector(memory))
-    system.DeclareStateOutputPort("target", target)
-    system.DeclarePeriodicDiscreteUpdateEvent(POLL_PERIOD, 0.0, update)
-    return measurement.Eval, estimate.Eval

@@ -22,9 +22,7 @@ class SvgsCompanionConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "SvgsCompanion":
         """Add a companion computer called `name` to `builder`."""
-        companion = SvgsCompanion(self, seed)
-        builder.AddNamedSystem(name, companion)
-        return companion
+        return builder.AddNamedSystem(name, SvgsCompanion(self, seed))
 
 
 class SvgsCompanion(Diagram):
@@ -48,7 +46,7 @@ class SvgsCompanion(Diagram):
     | `measurement` | `TARGET_MEASUREMENT` | one sighting of it |
     | `external_vision` | `EXTERNAL_VISION` | the vehicle's position, for the navigation filter |
 
-    A packet takes one period of 20 ms in each node, on top of the 175 to 230 ms of the paper.
+    A packet takes one period of 20 ms in each node.
     """
 
     def __init__(self, config: SvgsCompanionConfig, seed: int = 0):

@@ -208,7 +208,7 @@ class SvgsTransformations(LeafSystem):
 
     The node `transformations_drspider` of "High-altitude precision landing by SVGS" (Drones 8,
     37, 2024, Lemma 1). Equations in `pad_from_pose`. The attitude is that of the pose's time of
-    validity, from a history of 0.64 s. Its error is correlated from pose to pose, which the
+    validity, from a history of 0.8 s. Its error is correlated from pose to pose, which the
     covariance does not say.
 
     | event | when | does |

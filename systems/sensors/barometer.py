@@ -111,9 +111,9 @@ class Barometer(LeafSystem):
         d⁺ = d exp(−δ/τ) + drift √(1 − exp(−2δ/τ)) n,     d(0) = drift · n
         g = ground_effect · (T/mg) / (1 + (h/h½)²)
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 80 ms | 0 | samples the body as it was just before |
+    | event | when | does |
+    |---|---|---|
+    | update | every 80 ms from 0 | samples the body as it was just before |
 
     Parameters
     ----------

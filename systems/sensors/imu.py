@@ -1,4 +1,4 @@
-"""The inertial measurement unit: increments of angle and velocity, 125 times a second."""
+"""The inertial measurement unit: increments of angle and velocity, 100 times a second."""
 
 import math
 from dataclasses import dataclass
@@ -215,9 +215,9 @@ class Imu(LeafSystem):
     sample. Vibration enters as white noise: what the sensor's integration leaves
     of it is aliased.
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 10 ms | 0 | samples the body as it was just before |
+    | event | when | does |
+    |---|---|---|
+    | update | every 10 ms from 0 | samples the body as it was just before |
 
     Parameters
     ----------

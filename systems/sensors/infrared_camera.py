@@ -4,13 +4,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 
 from systems.configuration import (
     Finite,
@@ -22,19 +16,15 @@ from systems.configuration import (
     configuration,
 )
 from systems.schedule import CLOCK_PERIOD
+from systems.sensors.pad_camera import PadCamera
 from systems.signals.measurement import (
-    BODY_STATE,
     INFRARED,
     INFRARED_BLOBS,
-    PAD_STATE,
-    SEQUENCE_NUMBER,
-    TIME_OF_ARRIVAL,
     TIME_OF_VALIDITY,
     no_measurement,
 )
 from systems.signals.noise import stream_key
-from systems.signals.optional_input import optional_input
-from systems.vision.exposure import EXPOSURE, expose, is_due
+from systems.vision.exposure import is_due
 from systems.vision.infrared_blobs import (
     MAXIMUM_SPOTS,
     THRESHOLD,
@@ -46,8 +36,6 @@ from systems.vision.infrared_blobs import (
     write_geometric_blobs,
 )
 from systems.vision.pinhole import camera_mount, pinhole_camera
-
-_PAD_AT_ORIGIN = PAD_STATE.zeros()
 
 
 @configuration
@@ -90,7 +78,7 @@ class InfraredCameraConfig:
         return builder.AddNamedSystem(name, InfraredCamera(self, seed, stream=name))
 
 
-class InfraredCamera(LeafSystem):
+class InfraredCamera(PadCamera):
     """A camera under the vehicle that reports the brightest infrared spots.
 
     .. pydrake_system::
@@ -119,9 +107,9 @@ class InfraredCamera(LeafSystem):
 
     State: the measurement; the exposure it was made of (EXPOSURE).
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 20 ms | 0 | a frame, if one is due by its rate |
+    | event | when | does |
+    |---|---|---|
+    | update | every 20 ms from 0 | a frame, if one is due by its rate |
 
     So frames fall on the 20 ms grid, the first at 0, `frame_rate` a second on average
     (`systems.vision.exposure.is_due`).
@@ -137,22 +125,7 @@ class InfraredCamera(LeafSystem):
     def __init__(
         self, config: InfraredCameraConfig, seed: int = 0, *, stream: str = "infrared_camera"
     ):
-        super().__init__()
-        self._stream = stream
-        self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
-        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
-        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
-        measurement = self.DeclareDiscreteState(no_measurement(INFRARED))
-        self.DeclareDiscreteState(EXPOSURE.zeros())
-        self.DeclareStateOutputPort("measurement", measurement)
-        self.DeclareAbstractOutputPort(
-            "image",
-            lambda: Value(np.zeros((0, 0), dtype=np.uint8)),
-            self._calc_image,
-            prerequisites_of_calc={self.xd_ticket()},
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
+        super().__init__(config, seed, stream, no_measurement(INFRARED))
 
     def configure(self, config: InfraredCameraConfig, seed: int) -> None:
         """Take over another configuration and seed; every field may change."""
@@ -197,19 +170,7 @@ class InfraredCamera(LeafSystem):
         now = context.get_time()
         if not is_due(now, config.frame_rate):
             return
-        exposure = values.get_mutable_value(1)
-        expose(
-            self._body(context),
-            self._pad(context),
-            self.X_BC,
-            self.camera,
-            0.0,
-            exposure,
-        )
-        measurement = values.get_mutable_value(0)
-        measurement[TIME_OF_VALIDITY] = measurement[TIME_OF_ARRIVAL] = now
-        measurement[SEQUENCE_NUMBER] += 1.0
-        frame = int(measurement[SEQUENCE_NUMBER])
+        exposure, measurement, frame = self._expose(context, values, 0.0)
         if config.fidelity == "geometric":
             write_geometric_blobs(
                 exposure,
@@ -231,11 +192,6 @@ class InfraredCamera(LeafSystem):
             )
             write_blobs(blobs, count, self.camera, measurement)
 
-    def _calc_image(self, context: Context, output: Value) -> None:
-        measurement = context.get_discrete_state(0).value()
-        frame = int(measurement[SEQUENCE_NUMBER])
-        if frame < 0:  # before the first frame
-            output.set_value(np.zeros((self.config.height, self.config.width), dtype=np.uint8))
-        else:
-            exposure = context.get_discrete_state(1).value()
-            output.set_value(self._render(exposure, frame, measurement[TIME_OF_VALIDITY]))
+    def _image(self, context: Context, exposure: np.ndarray, frame: int) -> np.ndarray:
+        time = context.get_discrete_state(0).value()[TIME_OF_VALIDITY]
+        return self._render(exposure, frame, time)

@@ -71,9 +71,6 @@ class LogPlayback(LeafSystem):
     and negating components, which is exact; only the yaw of external vision is
     computed. Of two samples of one kind and one time of arrival the port shows the later.
 
-    | event | period | offset | what happens |
-    |---|---|---|---|
-
     Parameters
     ----------
     samples : SensorLog

@@ -90,9 +90,9 @@ class Magnetometer(LeafSystem):
 
         field_B = A R_WBᵀ earth_field + h + noise · n,    A = I + soft_iron · N,  h = hard_iron · n
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 80 ms | 0 | samples the body as it was just before |
+    | event | when | does |
+    |---|---|---|
+    | update | every 80 ms from 0 | samples the body as it was just before |
 
     Parameters
     ----------

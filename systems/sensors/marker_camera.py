@@ -2,16 +2,9 @@
 
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 
 from systems.configuration import (
     Finite,
@@ -23,28 +16,14 @@ from systems.configuration import (
     configuration,
 )
 from systems.schedule import CLOCK_PERIOD
-from systems.signals.measurement import (
-    BODY_STATE,
-    MARKER,
-    MARKER_LEVELS,
-    PAD_STATE,
-    SEQUENCE_NUMBER,
-    TIME_OF_ARRIVAL,
-    TIME_OF_VALIDITY,
-    no_measurement,
-)
+from systems.sensors.pad_camera import PadCamera
+from systems.signals.measurement import MARKER, MARKER_LEVELS, no_measurement
 from systems.signals.noise import stream_key
-from systems.signals.optional_input import optional_input
-from systems.vision.exposure import EXPOSURE, expose, is_due
+from systems.vision.exposure import is_due
 from systems.vision.marker_error_model import write_geometric_detection, write_marker_detection
 from systems.vision.nested_marker import NestedMarker, NestedMarkerDetector
 from systems.vision.pinhole import camera_mount, pinhole_camera
 from systems.vision.rendering import PadRenderer
-
-# OpenCV's threads save no time on images this small; they only burn a second core.
-cv2.setNumThreads(1)
-
-_PAD_AT_ORIGIN = PAD_STATE.zeros()
 
 
 @configuration
@@ -80,7 +59,7 @@ class MarkerCameraConfig:
         return builder.AddNamedSystem(name, MarkerCamera(self, seed, stream=name))
 
 
-class MarkerCamera(LeafSystem):
+class MarkerCamera(PadCamera):
     """A camera under the vehicle that finds the nested marker on the pad.
 
     .. pydrake_system::
@@ -116,9 +95,9 @@ class MarkerCamera(LeafSystem):
 
     State: the measurement; the exposure it was made of (EXPOSURE).
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 20 ms | 0 | a frame, if one is due by its rate |
+    | event | when | does |
+    |---|---|---|
+    | update | every 20 ms from 0 | a frame, if one is due by its rate |
 
     So frames fall on the 20 ms grid, the first at 0, `frame_rate` a second on average
     (`systems.vision.exposure.is_due`).
@@ -132,22 +111,7 @@ class MarkerCamera(LeafSystem):
     """
 
     def __init__(self, config: MarkerCameraConfig, seed: int = 0, *, stream: str = "marker_camera"):
-        super().__init__()
-        self._stream = stream
-        self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
-        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
-        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
-        measurement = self.DeclareDiscreteState(no_measurement(MARKER))
-        self.DeclareDiscreteState(EXPOSURE.zeros())
-        self.DeclareStateOutputPort("measurement", measurement)
-        self.DeclareAbstractOutputPort(
-            "image",
-            lambda: Value(np.zeros((0, 0), dtype=np.uint8)),
-            self._calc_image,
-            prerequisites_of_calc={self.xd_ticket()},
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
+        super().__init__(config, seed, stream, no_measurement(MARKER))
 
     def configure(self, config: MarkerCameraConfig, seed: int) -> None:
         """Take over another configuration and seed; every field may change.
@@ -181,10 +145,10 @@ class MarkerCamera(LeafSystem):
             )
         return self._renderer.render(exposure, frame)
 
-    def _detect(self, exposure: np.ndarray, measurement: np.ndarray) -> None:
+    def _detect(self, exposure: np.ndarray, frame: int, measurement: np.ndarray) -> None:
         if self._detector is None:
             self._detector = NestedMarkerDetector(self.pad_pattern, self.camera)
-        image = self._render(exposure, int(measurement[SEQUENCE_NUMBER]))
+        image = self._render(exposure, frame)
         corners = np.empty((MARKER_LEVELS, 4, 2))
         self._detector.detect(image, corners)
         write_marker_detection(
@@ -199,22 +163,9 @@ class MarkerCamera(LeafSystem):
 
     def _update(self, context: Context, values: DiscreteValues) -> None:
         config = self.config
-        now = context.get_time()
-        if not is_due(now, config.frame_rate):
+        if not is_due(context.get_time(), config.frame_rate):
             return
-        exposure = values.get_mutable_value(1)
-        expose(
-            self._body(context),
-            self._pad(context),
-            self.X_BC,
-            self.camera,
-            config.exposure_time,
-            exposure,
-        )
-        measurement = values.get_mutable_value(0)
-        measurement[TIME_OF_VALIDITY] = now - 0.5 * config.exposure_time
-        measurement[TIME_OF_ARRIVAL] = now
-        measurement[SEQUENCE_NUMBER] += 1.0
+        exposure, measurement, frame = self._expose(context, values, config.exposure_time)
         if config.fidelity == "geometric":
             write_geometric_detection(
                 exposure,
@@ -223,16 +174,11 @@ class MarkerCamera(LeafSystem):
                 config.light,
                 config.read_noise,
                 self._key,
-                int(measurement[SEQUENCE_NUMBER]),
+                frame,
                 measurement,
             )
         else:
-            self._detect(exposure, measurement)
+            self._detect(exposure, frame, measurement)
 
-    def _calc_image(self, context: Context, output: Value) -> None:
-        frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])
-        if frame < 0:  # before the first frame
-            output.set_value(np.zeros((self.config.height, self.config.width), dtype=np.uint8))
-        else:
-            exposure = context.get_discrete_state(1).value()
-            output.set_value(self._render(exposure, frame))
+    def _image(self, context: Context, exposure: np.ndarray, frame: int) -> np.ndarray:
+        return self._render(exposure, frame)

@@ -129,9 +129,9 @@ class RangeFinder(LeafSystem):
     above `maximum_incidence` gives a measurement with valid 0, range 0, quality 0.
     The beam is a line: the 3.6 deg of the real one average over 6 % of the range.
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 40 ms | 0 | samples the state of just before |
+    | event | when | does |
+    |---|---|---|
+    | update | every 40 ms from 0 | samples the state of just before |
 
     Parameters
     ----------

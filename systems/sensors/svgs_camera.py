@@ -3,17 +3,10 @@
 import math
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from numba import njit
 from pydantic import Field
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 
 from plants.svgs_beacons import SvgsBeaconsConfig
 from systems.configuration import (
@@ -27,19 +20,11 @@ from systems.configuration import (
 )
 from systems.frames import rotation_matrix
 from systems.schedule import CLOCK_PERIOD
-from systems.signals.measurement import (
-    BODY_STATE,
-    PAD_STATE,
-    SEQUENCE_NUMBER,
-    SVGS,
-    TIME_OF_ARRIVAL,
-    TIME_OF_VALIDITY,
-    no_measurement,
-)
+from systems.sensors.pad_camera import PadCamera
+from systems.signals.measurement import SVGS, no_measurement
 from systems.signals.noise import standard_normal, stream_key, uniform
-from systems.signals.optional_input import optional_input
 from systems.vision import svgs_selection as selection
-from systems.vision.exposure import EXPOSURE, SMEAR, expose
+from systems.vision.exposure import SMEAR
 from systems.vision.pinhole import camera_mount, pinhole_camera
 from systems.vision.svgs_blobs import (
     BLOB_SIZE,
@@ -53,11 +38,6 @@ from systems.vision.svgs_blobs import (
     render_spots,
     sample_blobs,
 )
-
-# OpenCV's threads save no time on images this small; they only burn a second core.
-cv2.setNumThreads(1)
-
-_PAD_AT_ORIGIN = PAD_STATE.zeros()
 
 _BLOB_COUNT = SVGS.index("blob_count")
 # The host's own state: when the next frame begins, exposures of the next and of the last frame.
@@ -121,9 +101,7 @@ class SvgsCameraConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "SvgsCamera":
         """Add an `SvgsCamera` of this configuration to `builder`."""
-        camera = builder.AddSystem(SvgsCamera(self, seed))
-        camera.set_name(name)
-        return camera
+        return builder.AddNamedSystem(name, SvgsCamera(self, seed))
 
 
 @njit(cache=True)
@@ -141,7 +119,7 @@ def _sensed_up(exposure, bias, noise, key, frame):
     return sensed / math.sqrt(sensed[0] ** 2 + sensed[1] ** 2 + sensed[2] ** 2)
 
 
-class SvgsCamera(LeafSystem):
+class SvgsCamera(PadCamera):
     """The Smartphone Video Guidance Sensor: the pose of an LED beacon in the camera's frame.
 
     .. pydrake_system::
@@ -156,9 +134,9 @@ class SvgsCamera(LeafSystem):
 
     | port | layout | meaning |
     |---|---|---|
-    | `body` | BODY_STATE | the vehicle's true state |
-    | `pad` | PAD_STATE | (optional) the pad's; unconnected: at rest in W's origin, yaw 0 |
-    | `measurement` | SVGS | the pose of one beacon, or an error code |
+    | `body` | `BODY_STATE` | the vehicle's true state |
+    | `pad` (optional) | `PAD_STATE` | the pad's; unconnected: at rest in W's origin, yaw 0 |
+    | `measurement` | `SVGS` | the pose of one beacon, or an error code |
     | `image` | uint8 array (height, width, 3) | the image behind it: blue, green, red |
 
     With `fidelity` "pixels" each frame is rendered and its blobs are found
@@ -181,31 +159,19 @@ class SvgsCamera(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every CLOCK_PERIOD from 0 | a frame, if the phone is ready for one |
+    | update | every 20 ms from 0 | a frame, if the phone is ready for one |
     """
 
+    channels = (3,)
+
     def __init__(self, config: SvgsCameraConfig, seed: int = 0):
-        super().__init__()
-        self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
-        pad = self.DeclareVectorInputPort("pad", PAD_STATE.size)
-        self._pad = optional_input(pad, _PAD_AT_ORIGIN)
         initial = no_measurement(SVGS)
         initial[SVGS.index("beacon")] = -1.0
         initial[SVGS.index("error_code")] = selection.NO_BLOBS
-        measurement = self.DeclareDiscreteState(initial)
-        self.DeclareDiscreteState(EXPOSURE.zeros())
+        super().__init__(config, seed, "svgs_camera", initial)
         host = np.zeros(_HOST_SIZE)
         host[_GAIN] = host[_FRAME_GAIN] = 1.0
         self.DeclareDiscreteState(host)
-        self.DeclareStateOutputPort("measurement", measurement)
-        self.DeclareAbstractOutputPort(
-            "image",
-            lambda: Value(np.zeros((0, 0, 3), dtype=np.uint8)),
-            self._calc_image,
-            prerequisites_of_calc={self.xd_ticket()},
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
 
     def configure(self, config: SvgsCameraConfig, seed: int = 0) -> None:
         """Take over another configuration and seed; every field may change."""
@@ -220,10 +186,10 @@ class SvgsCamera(LeafSystem):
         self._colours = config.beacons.colours()
         self._glint_colour = self._colours[("short", "medium", "long").index(config.glint_beacon)]
         self._options = config.options()
-        self._key = stream_key(seed, "svgs_camera")
-        self._glint_key = stream_key(seed, "svgs_camera.glints")
-        self._host_key = stream_key(seed, "svgs_camera.host")
-        bias = stream_key(seed, "svgs_camera.gravity_bias")
+        self._key = stream_key(seed, self._stream)
+        self._glint_key = stream_key(seed, f"{self._stream}.glints")
+        self._host_key = stream_key(seed, f"{self._stream}.host")
+        bias = stream_key(seed, f"{self._stream}.gravity_bias")
         self._gravity_bias = config.gravity_bias * np.array(
             [standard_normal(bias, 0, axis) for axis in range(3)]
         )
@@ -263,23 +229,11 @@ class SvgsCamera(LeafSystem):
         now = context.get_time()
         if now < context.get_discrete_state(2).value()[_NEXT_FRAME] - _TICK:
             return
-        measurement: Any = values.get_mutable_value(0)
-        exposure: Any = values.get_mutable_value(1)
         host: Any = values.get_mutable_value(2)
         gain = host[_FRAME_GAIN] = host[_GAIN]
-        exposure_time = gain * self.config.longest_exposure
-        expose(
-            self._body(context),
-            self._pad(context),
-            self.X_BC,
-            self.camera,
-            exposure_time,
-            exposure,
+        exposure, measurement, frame = self._expose(
+            context, values, gain * self.config.longest_exposure
         )
-        measurement[TIME_OF_VALIDITY] = now - 0.5 * exposure_time
-        measurement[TIME_OF_ARRIVAL] = now
-        measurement[SEQUENCE_NUMBER] += 1.0
-        frame = int(measurement[SEQUENCE_NUMBER])
         blobs = np.empty((MAXIMUM_BLOBS, BLOB_SIZE))
         if self.config.fidelity == "geometric":
             spots, spot_count = self._spots(exposure, gain, frame)
@@ -318,12 +272,7 @@ class SvgsCamera(LeafSystem):
         due = max(host[_NEXT_FRAME], now - CLOCK_PERIOD)
         host[_NEXT_FRAME] = due + self._period(measurement[_BLOB_COUNT], frame)
 
-    def _calc_image(self, context: Context, output: Value) -> None:
-        frame = int(context.get_discrete_state(0).value()[SEQUENCE_NUMBER])
-        if frame < 0:  # before the first frame
-            output.set_value(np.zeros((self.config.height, self.config.width, 3), dtype=np.uint8))
-            return
-        exposure = context.get_discrete_state(1).value()
+    def _image(self, context: Context, exposure: np.ndarray, frame: int) -> np.ndarray:
         gain = context.get_discrete_state(2).value()[_FRAME_GAIN]
         planes = self._render(exposure, gain, frame)
-        output.set_value(np.ascontiguousarray(np.moveaxis(planes[::-1], 0, -1)))
+        return np.ascontiguousarray(np.moveaxis(planes[::-1], 0, -1))

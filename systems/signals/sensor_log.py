@@ -38,7 +38,6 @@ KINDS = (
     "in air",
 )
 IMU, GNSS, BAROMETER, MAGNETOMETER, RANGE_FINDER, EXTERNAL_VISION, STATUS, IN_AIR = range(8)
-SENSORS = range(IMU, STATUS)  # the kinds that measure something
 WIDTHS = (12, 15, 3, 5, 3, 24, 6, 2)  # columns of each kind, the time stamp included
 ROW = max(WIDTHS)
 LOCAL_NED, LOCAL_FRD, BODY_FRD = 0, 1, 2  # frames of external vision

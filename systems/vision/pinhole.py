@@ -47,11 +47,6 @@ def pinhole_camera(
     return np.array([width, height, focal_length, focal_length, *principal_point, *distortion])
 
 
-def camera_matrix(camera: np.ndarray) -> np.ndarray:
-    """The matrix K of OpenCV's functions, shape (3, 3)."""
-    return np.array([[camera[FX], 0.0, camera[CX]], [0.0, camera[FY], camera[CY]], [0.0, 0.0, 1.0]])
-
-
 def camera_mount(p_BC: Sequence[float], yaw: float = 0.0) -> np.ndarray:
     """The mount of a camera that looks down, X_BC of shape (3, 4).
 

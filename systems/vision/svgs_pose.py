@@ -24,7 +24,8 @@ from systems.frames import (
     quaternion_multiply,
     rotation_matrix,
 )
-from systems.vision.pinhole import FX, tangents_of_pixel
+from systems.vision.pinhole import tangents_of_pixel
+from systems.vision.planar_pose import quaternion_from_matrix
 
 LED_COUNT = 4
 ANGLES = 8
@@ -246,12 +247,6 @@ def cramer_rao(leds: np.ndarray, pose: np.ndarray, angle_noise: float) -> np.nda
 
 
 @njit(cache=True)
-def pixel_residual(residual, camera):
-    """A residual in angles (rad) as pixels in the middle of the image."""
-    return residual * camera[FX]
-
-
-@njit(cache=True)
 def up_of_pose(pose):
     """T's z axis in C, shape (3,)."""
     R = rotation_matrix(pose[3:])
@@ -272,33 +267,6 @@ def level_frame(up):
     R = np.empty((3, 3))
     R[0], R[1], R[2] = x, y, up
     return R
-
-
-@njit(cache=True)
-def quaternion_of(R):
-    """The unit quaternion (w first) of a rotation matrix, by its largest component."""
-    t = np.array(
-        [
-            1.0 + R[0, 0] + R[1, 1] + R[2, 2],
-            1.0 + R[0, 0] - R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] + R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )
-    k = np.argmax(t)
-    q = np.empty(4)
-    if k == 0:
-        q[:] = t[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    elif k == 1:
-        q[:] = R[2, 1] - R[1, 2], t[1], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]
-    elif k == 2:
-        q[:] = R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], t[2], R[1, 2] + R[2, 1]
-    else:
-        q[:] = R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], t[3]
-    q /= math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    if q[0] < 0.0:
-        q = -q
-    return q
 
 
 @njit(cache=True)
@@ -340,5 +308,5 @@ def level_pose(leds, level, first, second, n_first, n_second, pose):
     R_LT = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     R_CL = np.ascontiguousarray(level.T)
     pose[:3] = R_CL @ p_L
-    pose[3:] = quaternion_of(R_CL @ R_LT)
+    pose[3:] = quaternion_from_matrix(R_CL @ R_LT)
     return depth

@@ -137,28 +137,6 @@ def least_deviation(ratios, chosen):
 
 
 @njit(cache=True)
-def least_deviation_window(ratios, chosen):
-    """As `least_deviation`, in O(n log n): the four are neighbours in the sorted list.
-
-    Replacing one of four numbers by one that lies between the others lowers their variance, so
-    the best four leave no gap.
-    """
-    order = np.argsort(ratios)
-    best = math.inf
-    for i in range(ratios.size - 3):
-        mean = 0.0
-        for k in range(4):
-            mean += 0.25 * ratios[order[i + k]]
-        deviation = 0.0
-        for k in range(4):
-            deviation += (ratios[order[i + k]] - mean) ** 2
-        if deviation < best:
-            best = deviation
-            chosen[:] = order[i : i + 4]
-    return 0.25 * best
-
-
-@njit(cache=True)
 def _distance_ratios(points, ratios):
     """The six distances of four points (4, 2), as parts of their sum, into `ratios` (6,)."""
     total, k = 0.0, 0

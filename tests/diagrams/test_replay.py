@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from diagrams.replay import ReplayDiagram, ReplayEkf2
-from runs.log_sources import FlightLog, read_log
+from runs.flight_log import FlightLog
+from runs.log_sources import read_log
 from runs.replay import OUTPUT_COLUMNS, gnss_delay, parameter_array, play, record_output
 from systems.estimators.ekf2 import layout as at
 from systems.estimators.ekf2.ekf2 import Ekf2Config

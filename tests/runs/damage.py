@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from runs.log_sources import ReplayError, read_log
+from runs.flight_log import ReplayError
+from runs.log_sources import read_log
 from runs.replay import parameter_array, parameter_values, play
 from runs.replay_diagnosis import diagnosis, summaries
 from runs.replay_tables import against_on_board

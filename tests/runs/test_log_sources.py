@@ -5,7 +5,8 @@ import gzip
 import numpy as np
 import pytest
 
-from runs.log_sources import ReplayError, read_log
+from runs.flight_log import ReplayError
+from runs.log_sources import read_log
 from runs.replay import parameter_array, parameter_values, play
 from systems.signals import sensor_log as logs
 from tests.runs.damage import csv_stream, damaged, outcome, ulog_stream

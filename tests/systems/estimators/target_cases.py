@@ -25,7 +25,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 
-PERIOD, OFFSET = 0.02, 0.0  # s, of the estimators' events
+PERIOD = 0.02  # s, of the estimators' events
 
 
 @dataclass
@@ -88,7 +88,7 @@ class Bench:
 
     def step(self, k: int, **inputs: np.ndarray) -> Any:
         """Event number k with these inputs; the first output as a flat array."""
-        self.context.SetTime(OFFSET + k * PERIOD)
+        self.context.SetTime(k * PERIOD)
         for name, value in inputs.items():
             self.system.GetInputPort(name).FixValue(self.context, value)
         update = self.system.EvalUniquePeriodicDiscreteUpdate(self.context)
@@ -116,7 +116,7 @@ def fly(
     measurement[:3] = -1.0
     times, targets = [], []
     for k in range(round(duration / PERIOD)):
-        t = OFFSET + k * PERIOD
+        t = k * PERIOD
         if k % every == 0 and k >= latency and visible(t):
             then = t - latency * PERIOD
             p = -sway.position(then) + noise * rng.standard_normal(3)

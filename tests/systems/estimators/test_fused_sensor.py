@@ -14,7 +14,7 @@ from systems.signals.measurement import (
     no_measurement,
 )
 from tests.system_contract import assert_matches_docstring, periodic_update
-from tests.systems.estimators.target_cases import OFFSET, PERIOD, Bench
+from tests.systems.estimators.target_cases import PERIOD, Bench
 
 # A vehicle 4 m above a pad that is ahead and to the left; the body's axes, and the camera
 # that looks down with its image's top to the front: x_C = −y_B, y_C = −x_B, z_C = −z_B.
@@ -109,7 +109,7 @@ def test_infrared_alone_takes_its_height_from_the_range_finder():
     np.testing.assert_allclose(position(found), P_BP_W, atol=1e-12)
     assert (found.valid, found.source) == (1.0, 1.0)
     assert found.time_of_validity == pytest.approx(-0.02)
-    assert found.time_of_arrival == OFFSET
+    assert found.time_of_arrival == 0.0
 
 
 def test_infrared_without_range_takes_the_estimated_height():

@@ -22,7 +22,6 @@ from systems.signals.measurement import (
 )
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.estimators.target_cases import (
-    OFFSET,
     PERIOD,
     Bench,
     Scene,
@@ -48,7 +47,7 @@ def test_topology():
     inputs, outputs = port_names(system)
     assert inputs == ["infrared", "marker", "range_finder", "estimate"]
     assert outputs[:2] == ["target", "measurement"]
-    assert periodic_update(system) == (PERIOD, OFFSET)
+    assert periodic_update(system) == (PERIOD, 0.0)
 
 
 def test_initial_outputs():
@@ -264,7 +263,7 @@ class World:
     def __init__(self, seed, settings, duration, pad_velocity=(0.0, 0.0, 0.0), wander=1.0):
         self.rng = np.random.default_rng(seed)
         self.settings, self.sway = settings, Sway(amplitude=(0.4, -0.3), height=6.0, descent=0.4)
-        self.times = OFFSET + PERIOD * np.arange(round(duration / PERIOD))
+        self.times = PERIOD * np.arange(round(duration / PERIOD))
         c = settings
         v = np.array(pad_velocity, dtype=float)
         p = np.array([0.5, -0.3, 0.0])

@@ -6,10 +6,8 @@ import pytest
 
 from systems.estimators import px4_target_kernel as kernel
 from systems.estimators.px4_target import (
-    PX4Target,
     PX4TargetConfig,
     PX4TargetFilter,
-    PX4VisionTarget,
     PX4VisionTargetConfig,
     PX4VisionTargetFilter,
 )
@@ -21,11 +19,7 @@ from tests.systems.estimators.target_cases import Sway, field, fly, horizontal_e
 FILTERS = [PX4TargetFilter(PX4TargetConfig()), PX4VisionTargetFilter(PX4VisionTargetConfig())]
 
 
-@pytest.mark.parametrize(
-    "system",
-    [*FILTERS, PX4Target(PX4TargetConfig()), PX4VisionTarget(PX4VisionTargetConfig())],
-    ids=lambda system: type(system).__name__,
-)
+@pytest.mark.parametrize("system", FILTERS, ids=lambda system: type(system).__name__)
 def test_topology(system):
     assert_matches_docstring(system)
 

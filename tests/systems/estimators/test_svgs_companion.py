@@ -35,7 +35,7 @@ from systems.signals.measurement import (
 )
 from systems.vision import svgs_selection as selection
 from systems.vision.pinhole import camera_mount
-from systems.vision.svgs_pose import quaternion_of
+from systems.vision.planar_pose import quaternion_from_matrix
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.estimators.target_cases import Sway, target_measurement
 
@@ -149,7 +149,7 @@ def seen_pose(R_WB, p_WB, X_BC, beacon: int, heading: float = 0.0) -> np.ndarray
     values = np.asarray(view[:])
     values[SVGS.index("beacon")] = beacon
     values[SVGS.slice("p_CT")] = R_WC.T @ (R_WP.apply(PLACEMENTS[beacon, :3]) - p_WC)
-    values[SVGS.slice("q_CT")] = quaternion_of(R_WC.T @ R_WT.as_matrix())
+    values[SVGS.slice("q_CT")] = quaternion_from_matrix(R_WC.T @ R_WT.as_matrix())
     for i, variance in enumerate([1e-4, 1e-4, 1e-2, 1e-5, 1e-5, 1e-6]):
         values[SVGS.index(f"covariance_{i}{i}")] = variance
     return values

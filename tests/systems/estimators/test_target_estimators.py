@@ -2,14 +2,21 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from systems.estimators.ardupilot_target import ArduPilotTargetConfig
 from systems.estimators.fused_sensor import FusedSensorConfig
 from systems.estimators.px4_target import PX4TargetConfig, PX4VisionTargetConfig
+from tests.system_contract import assert_matches_docstring
 from tests.systems.estimators.target_cases import Scene, Sway, field, horizontal_error, simulate
 
 CONFIGS = [ArduPilotTargetConfig, PX4TargetConfig, PX4VisionTargetConfig]
 AT_ORIGIN = {"infrared_position": [0.0, 0.0, 0.0], "marker_position": [0.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_topology(config):
+    assert_matches_docstring(config().add_to(DiagramBuilder(), "target_estimator"))
 
 
 @pytest.mark.parametrize("config", CONFIGS)

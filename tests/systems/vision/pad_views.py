@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from systems.vision.exposure import EXPOSURE, SMEAR
 from systems.vision.nested_marker import NestedMarker
-from systems.vision.pinhole import camera_matrix, pinhole_camera
+from systems.vision.pinhole import CX, CY, FX, FY, pinhole_camera
 
 PAD = NestedMarker((16, 45, 59), (0.8, 0.16, 0.032), 1.2)
 DISTORTION = (-0.05, 0.01, 0.0, 0.0)
@@ -16,6 +16,11 @@ LOOKING_DOWN = Rotation.from_euler("x", np.pi)
 
 def rng(seed: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(seed))
+
+
+def camera_matrix(camera: np.ndarray) -> np.ndarray:
+    """The matrix K of OpenCV's functions, shape (3, 3)."""
+    return np.array([[camera[FX], 0.0, camera[CX]], [0.0, camera[FY], camera[CY]], [0.0, 0.0, 1.0]])
 
 
 def exposure_at(p_WC, tilt=(0.0, 0.0), yaw=0.0, smear=(0.0, 0.0)) -> np.ndarray:

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 
 from systems.vision.pinhole import (
-    camera_matrix,
     camera_mount,
     is_in_image,
     pinhole_camera,
     pixel_of_tangents,
     tangents_of_pixel,
 )
-from tests.systems.vision.pad_views import rng
+from tests.systems.vision.pad_views import camera_matrix, rng
 
 STRONG = pinhole_camera(640, 480, 400.0, (-0.2, 0.05, 0.002, -0.003))
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from plants.svgs_beacons import BEACON_NAMES, SvgsBeaconsConfig
 from systems.vision.pinhole import pinhole_camera
+from systems.vision.planar_pose import quaternion_from_matrix
 from systems.vision.svgs_pose import (
     ANGLES,
     angles_of_pixels,
@@ -15,7 +16,6 @@ from systems.vision.svgs_pose import (
     level_pose,
     moved,
     predict,
-    quaternion_of,
     solve_pose,
 )
 
@@ -28,7 +28,7 @@ CASES = [(0, 20.0, 0.42), (1, 85.0, 0.91), (2, 200.0, 0.29)]
 def pose_at(distance: float, x: float = 1.0, y: float = -2.0) -> np.ndarray:
     """A beacon below a camera that looks down, a little tilted and turned."""
     R_CT = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    pose = np.array([x, y, distance, *quaternion_of(R_CT)])
+    pose = np.array([x, y, distance, *quaternion_from_matrix(R_CT)])
     return moved(pose, np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.4]))
 
 
@@ -118,7 +118,7 @@ def test_level_pose_of_a_level_beacon():
     np.testing.assert_allclose(level @ level.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(level @ up, [0.0, 0.0, 1.0], atol=1e-14)
     R_CT = level.T @ Rotation.from_euler("z", 0.7).as_matrix()
-    true = np.array([2.0, -1.0, 40.0, *quaternion_of(R_CT)])
+    true = np.array([2.0, -1.0, 40.0, *quaternion_from_matrix(R_CT)])
     p_L = (true[:3] + LEDS[1] @ R_CT.T) @ level.T
     seen = -p_L[:, :2] / p_L[:, 2:]
     found = np.empty(7)
