@@ -73,6 +73,8 @@ class MultirotorCascadeConfig:
     MPC_Z_VEL_I_ACC: NonNegative = 2.0  # (m/s2)/m
     MPC_Z_VEL_D_ACC: NonNegative = 0.0  # (m/s2)/(m/s2)
     MPC_VELD_LP: Positive = 5.0  # Hz, low pass of the velocity's derivative
+    # Hz, low pass of the horizontal P, I and D together: ArduCopter's, 2 there; None: none, as PX4
+    PSC_ACC_XY_FILT: Positive | None = None
 
     # Trajectory
     MPC_XY_CRUISE: Positive = 5.0  # m/s, where the setpoint names no maximum_speed
@@ -237,6 +239,11 @@ class MultirotorCascadeConfig:
         k.velocity_i_xy, k.velocity_i_z = self.MPC_XY_VEL_I_ACC, self.MPC_Z_VEL_I_ACC
         k.velocity_d_xy, k.velocity_d_z = self.MPC_XY_VEL_D_ACC, self.MPC_Z_VEL_D_ACC
         k.velocity_derivative_gain = _low_pass_gain(0.5 / (math.pi * self.MPC_VELD_LP))
+        k.correction_gain = (
+            1.0
+            if self.PSC_ACC_XY_FILT is None
+            else _low_pass_gain(0.5 / (math.pi * self.PSC_ACC_XY_FILT))
+        )
         k.speed_xy_maximum = self.MPC_XY_VEL_MAX
         k.speed_xy_cruise = self.MPC_XY_CRUISE
         k.speed_up, k.speed_down = self.MPC_Z_VEL_MAX_UP, self.MPC_Z_VEL_MAX_DN
@@ -284,9 +291,7 @@ class MultirotorCascadeConfig:
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "MultirotorCascade":
         """Add a `MultirotorCascade` of this configuration to `builder`."""
-        system = MultirotorCascade(self, seed)
-        builder.AddNamedSystem(name, system)
-        return system
+        return builder.AddNamedSystem(name, MultirotorCascade(self, seed))
 
 
 def _low_pass_gain(time_constant: float) -> float:
@@ -348,7 +353,8 @@ class MultirotorCascade(LeafSystem):
     turns within MPC_YAWRAUTO_MAX and MPC_YAWRAUTO_ACC.
 
         position    v_sp = v_ref + P (p_ref − p)
-        velocity    a_sp = a + a_ref + P (v_sp − v) + ∫ I (v_sp − v) − D v̇
+        velocity    a_sp = a + a_ref + P (v_sp − v) + ∫ I (v_sp − v) − D v̇, horizontally
+                    all but a + a_ref behind PSC_ACC_XY_FILT where that is set
         thrust      along (a_sp,x, a_sp,y, g), tilted by at most MPC_TILTMAX_AIR; its
                     vertical part is hover·(1 + a_sp,z/g); vertical goes before horizontal
                     but for MPC_THR_XY_MARG
@@ -357,13 +363,13 @@ class MultirotorCascade(LeafSystem):
         rates       α_sp = K (P (w_sp − w) + ∫ I (w_sp − w) − D ẇ)
         mixer       pseudo-inverse; roll and pitch before thrust before yaw; see `allocate`
 
-    All loops run at 125 Hz (PX4: 50 Hz, 250 Hz, 1 kHz and more), the smoother and the
+    All loops run at 100 Hz (PX4: 50 Hz, 250 Hz, 1 kHz and more), the smoother and the
     mixer's desaturation are our own, and the hover thrust is known, not estimated.
     The horizontal velocity integral is unwound by back-calculation, the others are
     clamped at saturation. Gains of the inner loops: `MultirotorCascadeConfig.gains`.
 
     Body rate. The gyro's sample is 10 ms younger than the estimate that is made from it
-    in the same phase, so w is delta_angle/dt minus a bias: the last gyro sample minus
+    at the same tick, so w is delta_angle/dt minus a bias: the last gyro sample minus
     the estimate's rate that came of it, low-passed with `gyro_bias_time`. Without a
     valid sample w is the estimate's rate. P and I see w behind IMU_GYRO_CUTOFF (second
     order), D its derivative behind IMU_DGYRO_CUTOFF (first order).
@@ -379,7 +385,7 @@ class MultirotorCascade(LeafSystem):
     does not (LNDMC_Z_VEL_MAX), the ground carries it and the thrust is kept upright
     ("Land Detector Configuration", ground contact).
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | initialize | at the start | the initial state of the last `configure` |
     | update | every 10 ms from 0 | one pass through all stages |

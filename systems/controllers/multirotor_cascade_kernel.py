@@ -41,6 +41,7 @@ PARAMETERS = Layout(
         "velocity_d_xy",  # 1
         "velocity_d_z",  # 1
         "velocity_derivative_gain",  # 1, of the derivative's low pass, per event
+        "correction_gain",  # 1, of the horizontal correction's low pass, per event
         "speed_xy_maximum",  # m/s
         "speed_xy_cruise",  # m/s, when the setpoint names none
         "speed_up",  # m/s
@@ -86,6 +87,7 @@ STATE = Layout(
         "yaw_ref",  # rad
         "yaw_rate_ref",  # rad/s
         *vector("velocity_integral"),  # m/s2
+        *vector("correction", "xy"),  # m/s2, asked for on top of the trajectory, low-passed
         *vector("v_last"),  # m/s
         *vector("v_derivative"),  # m/s2, low-passed
         "gyro_known",  # 0/1, gyro_last holds a sample
@@ -148,6 +150,7 @@ _VEL_I_Z = _index("velocity_i_z")
 _VEL_D_XY = _index("velocity_d_xy")
 _VEL_D_Z = _index("velocity_d_z")
 _VEL_LP = _index("velocity_derivative_gain")
+_CORR_LP = _index("correction_gain")
 _SPEED_XY = _index("speed_xy_maximum")
 _CRUISE = _index("speed_xy_cruise")
 _SPEED_UP = _index("speed_up")
@@ -189,6 +192,7 @@ _A_REF = _index("a_ref_x")
 _YAW_REF = _index("yaw_ref")
 _YAW_RATE_REF = _index("yaw_rate_ref")
 _VEL_INT = _index("velocity_integral_x")
+_CORRECTION = _index("correction_x")
 _V_LAST = _index("v_last_x")
 _V_DOT = _index("v_derivative_x")
 _GYRO_KNOWN = _index("gyro_known")
@@ -627,14 +631,20 @@ def _position_and_velocity(x, out, estimate, setpoint, k, flying):
     if flying and not math.isnan(out[_OUT_V + 2]):
         out[_OUT_V + 2] = clamp(out[_OUT_V + 2], -k[_SPEED_DOWN], k[_SPEED_UP])
     for i in range(3):
-        out[_OUT_A + i] = 0.0
-        if not math.isnan(out[_OUT_V + i]):
-            out[_OUT_A + i] = (
-                x[_A_REF + i]
-                + k[_VEL_P_Z if i == 2 else _VEL_P_XY] * (out[_OUT_V + i] - estimate[_V + i])
+        correction = 0.0
+        controlled = not math.isnan(out[_OUT_V + i])
+        if controlled:
+            correction = (
+                k[_VEL_P_Z if i == 2 else _VEL_P_XY] * (out[_OUT_V + i] - estimate[_V + i])
                 + x[_VEL_INT + i]
                 - k[_VEL_D_Z if i == 2 else _VEL_D_XY] * x[_V_DOT + i]
             )
+        if i < 2:
+            x[_CORRECTION + i] += k[_CORR_LP] * (correction - x[_CORRECTION + i])
+            correction = x[_CORRECTION + i]
+        out[_OUT_A + i] = correction
+        if controlled:
+            out[_OUT_A + i] += x[_A_REF + i]
             if flying and math.isfinite(setpoint[_A_SP + i]):
                 out[_OUT_A + i] += setpoint[_A_SP + i]
 
@@ -686,6 +696,7 @@ def cascade_step(x, rotors, out, estimate, imu, setpoint, k, mixer):
     if not armed:
         _follow_vehicle(x, estimate)
         x[_TAKEOFF] = x[_CONTACT] = 0.0
+        x[_CORRECTION] = x[_CORRECTION + 1] = 0.0
         rotors[:] = 0.0
         out[:] = 0.0
         out[_OUT_Q] = 1.0

@@ -29,6 +29,7 @@ class Receiver:
     horizontal_drift: float  # m, of a first-order Gauss-Markov process
     vertical_drift: float  # m
     drift_time: float  # s, time constant of both
+    smoothing_time: float  # s, time constant of a low pass behind the drift; 0 is none
     horizontal_offset: float  # m, constant in a run
     vertical_offset: float  # m
     horizontal_velocity_noise: float  # m/s, white
@@ -49,16 +50,21 @@ RECEIVERS = {
     #   1994, as in Beard and McLain, "Small Unmanned Aircraft", 2012, table 7.2. In a minute this
     #   drifts by 0.69 m rms an axis. D. L. Wilson's web page "Correlation of errors" shows a fast
     #   part of about a minute besides in one receiver and none in another; it is left out.
-    # - White noise: consecutive positions of a receiver at rest, after the landing in the outdoor
-    #   flight log `outdoor_gps_quad.ulg`, 16 mm horizontally and 35 mm vertically.
+    # - Smoothing: in the 9 s after the landing in the outdoor flight log `outdoor_gps_quad.ulg` the
+    #   receiver at rest wanders by 13, 25, 54, 94, 144, 220 mm rms an axis in 0.2, 0.4, 1, 2, 4 and
+    #   6 s: in proportion to the time at first, to its root later, as a drift does behind a low
+    #   pass. With 1.4 s the drift above gives 11, 21, 48, 88, 149, 194 mm; 5 mm of white noise (the
+    #   message counts in 11 mm) make the first two 13 and 22.
+    # - White noise vertically: what is left of that log's 35 mm between consecutive altitudes.
     # - Velocity: 0.05 m/s (50 %) by the data sheet; vertical half as much again, as PX4 takes it.
     # - Accuracies, satellites and dilution: as reported in that flight.
     "standalone": Receiver(
-        horizontal_noise=0.016,
-        vertical_noise=0.035,
+        horizontal_noise=0.005,
+        vertical_noise=0.032,
         horizontal_drift=2.5 / _CEP,
         vertical_drift=2.5 / _CEP * 9.2 / 4.7,
         drift_time=1100.0,
+        smoothing_time=1.4,
         horizontal_offset=0.0,
         vertical_offset=0.0,
         horizontal_velocity_noise=0.05 / _CEP,
@@ -80,6 +86,7 @@ RECEIVERS = {
         horizontal_drift=0.01 / _CEP * math.sqrt(0.5),
         vertical_drift=0.01 / _R50 * math.sqrt(0.5),
         drift_time=100.0,
+        smoothing_time=0.0,
         horizontal_offset=0.01 / _CEP,
         vertical_offset=0.01 / _R50,
         horizontal_velocity_noise=0.05 / _CEP,
@@ -110,6 +117,7 @@ class GnssConfig:
     horizontal_drift: Metres | None = None  # m, correlated, one sigma an axis
     vertical_drift: Metres | None = None  # m
     drift_time: Positive | None = None  # s, correlation time of the drift
+    smoothing_time: NonNegative | None = None  # s, of the receiver's filter behind it; 0 is none
     horizontal_offset: Metres | None = None  # m, constant in a run, one sigma an axis
     vertical_offset: Metres | None = None  # m
     horizontal_velocity_noise: NonNegative | None = None  # m/s, white, one sigma an axis
@@ -154,7 +162,9 @@ def geodetic_from_world(p_W, origin):
 
 
 @njit(cache=True)
-def sample_gnss(index, time, body, key, origin, sigmas, keep, relative, reported, output, memory):
+def sample_gnss(
+    index, time, body, key, origin, sigmas, keep, blend, relative, reported, output, memory
+):
     """Write one GNSS measurement.
 
     Parameters
@@ -173,24 +183,27 @@ def sample_gnss(index, time, body, key, origin, sigmas, keep, relative, reported
         Standard deviations in W of white noise, drift (m), velocity (m/s); the offset itself (m).
     keep : float
         What a step leaves of the drift, exp(−δ/τ).
+    blend : float
+        What a step takes over of it, 1 − exp(−δ/T); 1 without smoothing.
     relative : bool
         Whether errors count from those at the first sample.
     reported : array of shape (6,)
         The last six fields of `GNSS`.
     output : array of shape (16,)
         `GNSS`, changed in place.
-    memory : array of shape (6,)
-        Drift now and at the first sample (m, W), changed in place.
+    memory : array of shape (9,)
+        Drift, the smoothed drift, and its first sample (m, W), changed in place.
     """
     n = standard_normals(key, index, 9)
     p_W = np.empty(3)
     for i in range(3):
         drift = sigmas[1, i] * n[3 + i]
         if index == 0:
-            memory[i] = memory[3 + i] = drift
+            memory[i] = memory[3 + i] = memory[6 + i] = drift
         else:
             memory[i] = keep * memory[i] + math.sqrt(1.0 - keep * keep) * drift
-        error = memory[i] - memory[3 + i] if relative else memory[i] + sigmas[3, i]
+            memory[3 + i] += blend * (memory[i] - memory[3 + i])
+        error = memory[3 + i] - memory[6 + i] if relative else memory[3 + i] + sigmas[3, i]
         p_W[i] = body[_P + i] + error + sigmas[0, i] * n[i]
         output[_V_W + i] = body[_V + i] + sigmas[2, i] * n[6 + i]
     output[0] = output[1] = time
@@ -218,13 +231,15 @@ class Gnss(LeafSystem):
 
     With δ = 1/rate, n standard normal and an axis each,
 
-        p = p_WB + offset + d + noise · n          (W, then WGS84)
+        p = p_WB + offset + s + noise · n          (W, then WGS84)
+        s⁺ = s + (1 − exp(−δ/T)) (d⁺ − s),                s(0) = d(0)
         d⁺ = d exp(−δ/τ) + drift √(1 − exp(−2δ/τ)) n,     d(0) = drift · n
         v = v_WB + velocity_noise · n
 
-    so two errors Δt apart differ by drift √(2 (1 − exp(−Δt/τ))) rms an axis, which
-    is what a landing at the place of take-off sees of a standalone receiver. The
-    receiver's latency is the business of a `DelayLine`.
+    with T the smoothing time, so two errors Δt apart differ by about
+    drift √(2/τ (Δt − T (1 − exp(−Δt/T)))) rms an axis while Δt is short of τ, and in the
+    end by drift √2, which is what a landing at the place of take-off sees of a standalone
+    receiver. The receiver's latency is the business of a `DelayLine`.
 
     The event comes every 20 ms, and sample k is taken by the first one at or after k/rate.
 
@@ -246,7 +261,7 @@ class Gnss(LeafSystem):
         self.configure(config, seed)
         self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
         output = self.DeclareDiscreteState(no_measurement(GNSS))
-        self.DeclareDiscreteState(np.zeros(6))
+        self.DeclareDiscreteState(np.zeros(9))
         self.DeclareStateOutputPort("measurement", output)
         self.DeclarePeriodicDiscreteUpdateEvent(CLOCK_PERIOD, 0.0, self._update)
 
@@ -257,6 +272,8 @@ class Gnss(LeafSystem):
         self._relative = config.relative_to_start
         self._origin = np.array(config.origin)
         self._keep = math.exp(-1.0 / (config.rate * receiver.drift_time))
+        smoothing = config.rate * receiver.smoothing_time  # samples
+        self._blend = 1.0 if smoothing == 0.0 else -math.expm1(-1.0 / smoothing)
         self._key = stream_key(seed, f"{self._stream}.noise")
         drawn = standard_normals(stream_key(seed, f"{self._stream}.offset"), 0, 3)
         kinds = ("noise", "drift", "velocity_noise", "offset")
@@ -287,6 +304,7 @@ class Gnss(LeafSystem):
             self._origin,
             self._sigmas,
             self._keep,
+            self._blend,
             self._relative,
             self._reported,
             discrete_state.get_mutable_value(0),

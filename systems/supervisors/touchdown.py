@@ -41,8 +41,9 @@ class TouchdownDetector:
     It must last `duration`; `slow_factor` times longer where the height is not
     measured, and again where rotor commands are known but not low.
 
-    In the air it is while armed, at rest while not. As in PX4, ground effect is to be expected
-    while it is asked to descend with `minimum_commanded_descent` and hardly moves horizontally.
+    It is at rest until armed, and in the air from when it first moves vertically faster than
+    `maximum_vertical_speed` until disarmed. As in PX4, ground effect is to be expected while it is
+    asked to descend with `minimum_commanded_descent` and hardly moves horizontally.
     """
 
     def __init__(self, config: TouchdownDetectorConfig):
@@ -54,7 +55,11 @@ class TouchdownDetector:
         c, m = self.config, s.memory
         descent = -m.setpoint_vz if math.isnan(m.setpoint_z) else 0.0
         horizontally_still = math.hypot(s.vx, s.vy) < c.maximum_horizontal_speed
-        m.in_air, m.at_rest = m.armed, 1.0 - m.armed
+        m.at_rest = 1.0 - m.armed
+        if m.armed == 0.0:
+            m.in_air = 0.0
+        elif abs(s.vz) > c.maximum_vertical_speed:
+            m.in_air = 1.0
         m.in_ground_effect = float(descent >= c.minimum_commanded_descent and horizontally_still)
         felt = (
             m.armed > 0.0

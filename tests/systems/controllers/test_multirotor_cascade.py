@@ -187,7 +187,7 @@ def test_rotor_commands_have_the_vehicles_size():
         assert controller.GetOutputPort("setpoints").size() == CASCADE_SETPOINTS.size
 
 
-def test_updates_every_8_ms_in_the_second_phase():
+def test_updates_every_tick():
     controller = MultirotorCascade(MultirotorCascadeConfig())
     assert periodic_update(controller) == (PLANT_PERIOD, 0.0)
 

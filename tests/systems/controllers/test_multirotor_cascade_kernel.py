@@ -329,13 +329,15 @@ def test_nothing_happens_before_the_attitude_is_known():
     np.testing.assert_array_equal(controller.x, before[1])
 
 
-def test_velocity_pid_is_the_textbooks():
-    controller = Controller()
+@pytest.mark.parametrize("cutoff", [None, 2.0])
+def test_velocity_pid_is_the_textbooks(cutoff):
+    controller = Controller(PSC_ACC_XY_FILT=cutoff)
     k = controller.config
     v = 0.3
     goal = setpoint(v=(1.0, 0.0, 0.0))
-    integral = derivative = last = 0.0
+    integral = derivative = last = correction = 0.0
     smoothed = acceleration = 0.0
+    gain = 1.0 if cutoff is None else 1 - math.exp(-2 * math.pi * cutoff * PLANT_PERIOD)
     for n in range(200):
         measured = v + 0.1 * math.sin(0.05 * n)
         out = controller.step(hovering(v_WB_x=measured), goal)
@@ -349,10 +351,9 @@ def test_velocity_pid_is_the_textbooks():
         )
         last = measured
         error = smoothed - measured
-        expected = (
-            acceleration + k.MPC_XY_VEL_P_ACC * error + integral - k.MPC_XY_VEL_D_ACC * derivative
-        )
-        assert out.a_WB_x == pytest.approx(expected, abs=1e-9)
+        asked = k.MPC_XY_VEL_P_ACC * error + integral - k.MPC_XY_VEL_D_ACC * derivative
+        correction += gain * (asked - correction)
+        assert out.a_WB_x == pytest.approx(acceleration + correction, abs=1e-9)
         integral += k.MPC_XY_VEL_I_ACC * error * PLANT_PERIOD
     assert abs(integral) > 0.01
 

@@ -117,11 +117,28 @@ def test_white_noise():
 
 def test_drift_is_a_gauss_markov_process():
     """Over 300 time constants of 1 s: σ, and exp(−Δt/τ) between two samples."""
-    drift = errors(300.0, horizontal_drift=2.0, vertical_drift=4.0, drift_time=1.0)
+    figures = {"horizontal_drift": 2.0, "vertical_drift": 4.0}
+    drift = errors(300.0, **figures, drift_time=1.0, smoothing_time=0.0)
     np.testing.assert_allclose(drift.std(axis=0), [2.0, 2.0, 4.0], rtol=0.25)
     for lag in (1, 3, 5, 10):
         correlation = [np.corrcoef(drift[lag:, i], drift[:-lag, i])[0, 1] for i in range(3)]
         assert np.mean(correlation) == pytest.approx(math.exp(-0.2 * lag), abs=0.12)
+
+
+def wander(lag):
+    """What a standalone receiver's error changes by in a few seconds, one sigma an axis, m."""
+    receiver = RECEIVERS["standalone"]
+    t = receiver.smoothing_time
+    rate = 2.0 * receiver.horizontal_drift**2 / receiver.drift_time  # m2/s
+    return np.sqrt(rate * (lag - t * -np.expm1(-lag / t)) + 2.0 * receiver.horizontal_noise**2)
+
+
+def test_the_receiver_smooths_its_drift():
+    """In proportion to time at first, and to its root when it is long to the smoothing time."""
+    run = errors_of("standalone", 400.0, 3)[50:, :2]
+    for lag in (1, 2, 5, 10, 20):
+        moved = run[lag:] - run[:-lag]
+        assert np.sqrt(np.mean(moved**2)) == pytest.approx(wander(0.2 * lag), rel=0.2)
 
 
 def test_offset_is_constant_in_a_run_and_drawn_for_each():
@@ -202,22 +219,22 @@ def test_drift_agrees_with_the_thesis_s_landings(duration):
 
 
 def test_a_real_receiver_at_rest():
-    """After the landing in an outdoor flight: white noise, and a drift of a plausible size."""
-    log = ULog(str(shared("data/ulg/outdoor_gps_quad.ulg")), ["sensor_gps"])
+    """After the landing in an outdoor flight: hardly any white noise, and a smooth drift."""
+    log = ULog(str(shared("data/ulg/outdoor_gps_quad.ulg")), ["vehicle_gps_position"])
     gps = log.data_list[0].data
     time = (gps["timestamp"] - gps["timestamp"][0]) * 1e-6
-    rest = time > 70.5
-    north = 111.2e3 * gps["latitude_deg"][rest]
+    rest = time > 70.7
+    latitude, longitude = gps["latitude_deg"][rest], gps["longitude_deg"][rest]
+    place = 111.2e3 * np.stack((latitude, np.cos(np.radians(latitude[0])) * longitude), axis=1)
     receiver = RECEIVERS["standalone"]
+    for lag in (1, 2, 5, 10, 20, 30):  # in 9 s a few of them are independent
+        moved = place[lag:] - place[:-lag]
+        assert np.sqrt(np.mean(moved**2)) == pytest.approx(wander(0.2 * lag), rel=0.25)
     # The second difference of white noise has six times its variance, that of a drift hardly any.
-    white = np.diff(north, 2).std() / math.sqrt(6)
-    assert white == pytest.approx(receiver.horizontal_noise, rel=0.25)
+    assert np.diff(place, 2, axis=0).std() / math.sqrt(6) < 2.0 * receiver.horizontal_noise
     assert np.median(gps["eph"]) == pytest.approx(receiver.horizontal_accuracy, rel=0.05)
     assert np.median(gps["epv"]) == pytest.approx(receiver.vertical_accuracy, rel=0.05)
     assert np.median(gps["s_variance_m_s"]) == pytest.approx(receiver.speed_accuracy, rel=0.05)
-    span = time[rest][-1] - time[rest][0]
-    sigma = receiver.horizontal_drift * math.sqrt(2.0 * span / receiver.drift_time)
-    assert 0.1 * sigma < abs(north[-1] - north[0]) < 3.0 * sigma
 
 
 def test_deterministic_by_seed():

@@ -155,9 +155,11 @@ def test_waits_until_the_estimate_has_been_valid_for_a_while():
     ("state", "memory", "v", "expected"),
     [
         ("wait", {"armed": 0.0}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ("climb", {}, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0)),  # still on the ground
         ("climb", {}, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+        ("climb", {"in_air": 1.0}, (0.0, 0.0, 0.1), (0.0, 1.0, 0.0)),
         ("descend", {"setpoint_vz": -0.5}, (0.0, 0.0, -0.5), (0.0, 1.0, 1.0)),
-        ("descend", {"setpoint_vz": -0.2}, (0.0, 0.0, -0.2), (0.0, 1.0, 0.0)),  # too slowly
+        ("descend", {"setpoint_vz": -0.2}, (0.0, 0.0, -0.3), (0.0, 1.0, 0.0)),  # too slowly
         ("descend", {"setpoint_vz": -0.5}, (2.0, 0.0, -0.5), (0.0, 1.0, 0.0)),  # and sideways
     ],
 )
