@@ -89,10 +89,10 @@ class SvgsCameraChannel:
     sensor: SvgsCameraConfig = Field(default_factory=SvgsCameraConfig)
     faults: FaultInjectorConfig | None = None  # null: no injector, and no commands to it
     # s; SVGS paper 2.4: 175 to 230 ms to the flight controller, of which the three nodes of the
-    # companion computer take 18 to 48 ms
+    # companion computer take 64 to 69 ms
     latency: DelayLineConfig = Field(
         default_factory=lambda: DelayLineConfig(
-            latency=UniformLatency(shortest=0.145, longest=0.190)
+            latency=UniformLatency(shortest=0.110, longest=0.162)
         )
     )
 
