@@ -185,9 +185,12 @@ class LandingWithoutGpsDiagram:
                 builder.Connect(port[source], self.systems[name].GetInputPort(target))
 
         connect("aircraft", command="command")
+        # what is wrong with the recorded altitude is wrong with the laser made from it (6.1: "the
+        # laser measurements are simulated"), not with the altimeter on board, nor with the fix,
+        # which stands for the filter's initial parameters
         for sensor in simulated.values():
             if sensor != "tracker":
-                connect(sensor, state="state")
+                connect(sensor, state=seen if sensor in ("baro", "gps") else "state")
         if "tracker" in self.systems:
             self.systems["camera"] = scenario.camera.add_to(builder, "camera", seed, runway)
             port["raw_picture"] = self.systems["camera"].GetOutputPort("measurement")
@@ -321,6 +324,12 @@ def require_sight(scenario: LandingWithoutGpsScenario) -> None:
     aircraft = scenario.aircraft
     if isinstance(aircraft, RecordedFlightConfig):
         aircraft = FixedWingConfig()  # its recording may be of any; the trim is about the same
+    for axis in ("horizontal", "vertical"):
+        wide = getattr(camera, f"{axis}_field_of_view")
+        if wide >= 180.0:
+            raise ValueError(
+                f"camera.{axis}_field_of_view: expected less than 180 deg, found {wide:g}"
+            )
     optics = camera.optics()
     far, near = max(tracker.clicks), max(tracker.loss_distance, 1.0)
     if far <= near:

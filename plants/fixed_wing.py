@@ -52,7 +52,7 @@ class FixedWingConfig:
     wind_spread: NonNegative = 0.0  # m/s, one sigma of each component from run to run
     turbulence_wind: NonNegative = 0.0  # m/s, wind at 20 ft that sets the turbulence; 0 none
     start: Vector3 = Field(  # m, runway frame: right of the axis, along it, down
-        default_factory=lambda: [0.0, -5000.0, -526.7]
+        default_factory=lambda: [0.0, -5000.0, -521.9]
     )
     start_course: Finite = 0.0  # deg, against the landing direction
     start_vertical_speed: Finite = 3.47  # m/s, positive down; on the landing trajectory

@@ -191,7 +191,7 @@ class RecordedFlight(LeafSystem):
     | antenna | ANTENNA | replayed where recorded |
     | inertial | INERTIAL_NAVIGATION | replayed where recorded |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | initialize | at the start | the first sample |
     | advance | every 10 ms from 0 | the flight at t + 10 ms, and the samples up to t |

@@ -34,6 +34,7 @@ from systems.sensors.runway_tracker import track
 from systems.sensors.runway_wheel_encoder import wheel_sample
 from systems.signals.measurement import no_measurement
 from systems.signals.runway_measurement import (
+    ACT_OFFSET,
     AIRSPEED,
     ANTENNA,
     BARO_INERTIAL,
@@ -117,6 +118,8 @@ def _fly(
     no_fix, no_antenna, no_picture = fix.copy(), antenna.copy(), picture.copy()
     no_laser, no_wheels, no_airspeed = laser.copy(), wheels.copy(), airspeed.copy()
     seen = state.copy()
+    if not closed:
+        interpolate_flight(seen, flight, 0.0, terrain, geometry, 0.0, gear)
     inertial_memory = np.zeros(7)
     baro_line = _pipeline(baro.shape[0], 16)
     fix_line = _pipeline(fix.shape[0], 16)
@@ -130,7 +133,6 @@ def _fly(
         time = k * _TICK
         # sense and decide: everyone sees the others' values from before this tick
         now, now_seen = state.copy(), seen.copy()
-        camera_before = camera.copy()
         if k % 4 == 0:
             if phase == 0.0:
                 silent = time - max(fix[0], 0.0) if fix[3] > 0.0 else silent + 4 * _TICK
@@ -154,7 +156,7 @@ def _fly(
         if k % 2 == 0:
             tick = k // 2
             if tick % baro_model[3] == 0:
-                sample = baro_inertial_sample(now, time, samples[0], baro_model[0])
+                sample = baro_inertial_sample(now_seen, time, samples[0], baro_model[0])
                 enqueue(baro_line, sample, time + baro_model[2])
                 samples[0] += 1.0
             release(baro_line, baro, time)
@@ -166,7 +168,7 @@ def _fly(
         if k % 4 == 0:
             tick = k // 4
             if tick % fix_model[3] == 0:
-                sample = fix_sample(now, time, int(samples[1]), fix_model[0], fix_model[1])
+                sample = fix_sample(now_seen, time, int(samples[1]), fix_model[0], fix_model[1])
                 enqueue(fix_line, sample, time + fix_model[2])
                 samples[1] += 1.0
             release(fix_line, fix, time)
@@ -186,13 +188,6 @@ def _fly(
             wheels[:] = wheel_sample(now, time, index, wheels_model[0], wheels_model[1])
             airspeed[:] = airspeed_sample(now, time, index, airspeed_model[0], airspeed_model[1])
             samples[5] += 1.0
-        if camera_before[2] + 1.0 > picture_line[0]:
-            picture_line[0] = camera_before[2] + 1.0
-            distance = math.hypot(now_seen[0], now_seen[1])
-            found = track(camera_before, distance, time, tracker_model[0], tracker_model[1])
-            enqueue(picture_line, found, max(time, camera_before[0]) + tracker_model[2])
-        if picture_line[1] > 0.0:
-            release(picture_line, picture, time)
         # estimate and act, half a tick later
         if k % 2 == 0 and estimate[1] > 0.0:
             control(
@@ -228,6 +223,15 @@ def _fly(
                 phase,
                 filter_model,
             )
+        if k % 4 == 0:  # after the filter, which sees what the tracker said before
+            acting = ACT_OFFSET + time
+            if camera[2] + 1.0 > picture_line[0]:
+                picture_line[0] = camera[2] + 1.0
+                distance = math.hypot(seen[0], seen[1])
+                found = track(camera, distance, acting, tracker_model[0], tracker_model[1])
+                enqueue(picture_line, found, max(acting, camera[0]) + tracker_model[2])
+            if picture_line[1] > 0.0:
+                release(picture_line, picture, acting)
 
 
 def fly_compiled(scenario: LandingWithoutGpsScenario, seed: int) -> dict[str, Any]:

@@ -55,14 +55,17 @@ class RunwayErrorFilterConfig:
     tuning: Literal["theoretical", "hand"] = "hand"  # hand: Q 2.25, R 400, 100 and 400 times
     # theoretical standard deviations of one step of 20 ms
     position_walk: Metres = 0.001  # m, √q1 and √q2
-    altitude_walk: Metres = 0.01  # m, √q3: scale factor of the altimeter times the descent
+    # m, √q3: the altimeter's scale factor of 1 % times the 7 cm of descent in a step, rounded
+    altitude_walk: Metres = 0.001
     speed_walk: NonNegative = 0.0002  # m/s, √q4 and √q5: 0.02 m/s in a landing of 150 s
     return_noise: Positive = 0.2  # deg, of the antenna's azimuth
     # mrad; secret, too: chosen so that it converges as slowly as the thesis's (docs). A sighting
     # may be off by the harmonisation, half a degree about each axis, by the heading, 0.4 deg
     # (ARINC 704), and by a click and a track of some pixels of 0.05 deg
     final_noise: Positive = 20.0
-    laser_noise: Positive = 1.0  # m, 1 % of the range at its activation
+    # m: "taking into account the sensor accuracy only, and not the error introduced by the
+    # terrain elevation" (4.3); of the SF11
+    laser_noise: Positive = 0.1
     # the laser's activation (4.2): the share of the altitude's innovation that is taken over
     # at once (1 reset, 0 covariance only), and the standard deviation that is added
     altitude_reset: Probability = 0.5

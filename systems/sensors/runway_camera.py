@@ -31,10 +31,11 @@ class RunwayCameraConfig:
     vertical_field_of_view: Positive = 24.0  # deg, FOV_V
     position: Vector3 = Field(default_factory=lambda: [2.5, 0.0, 0.5])  # m, body frame, the nose
     mounting: Vector3 = Field(default_factory=lambda: [0.0, -3.0, 0.0])  # deg, yaw, pitch, roll
-    # deg, one sigma of the harmonisation about each axis: roll X, pitch Y, yaw Z (6.2)
-    harmonisation_roll_spread: NonNegative = 0.3
-    harmonisation_pitch_spread: NonNegative = 0.3
-    harmonisation_yaw_spread: NonNegative = 0.3
+    # deg, one sigma of the harmonisation about each axis: roll X, pitch Y, yaw Z; half a degree
+    # is the limit that those responsible find reasonable (6.2), taken for two sigma
+    harmonisation_roll_spread: NonNegative = 0.25
+    harmonisation_pitch_spread: NonNegative = 0.25
+    harmonisation_yaw_spread: NonNegative = 0.25
     # m, one sigma of each component of the position; 16 cm is the tolerance of 6.3
     position_spread: Metres = 0.05
     # s, L_ti: from the world to the camera's output, where the time stamp is put (6.4)

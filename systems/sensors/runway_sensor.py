@@ -1,7 +1,8 @@
 """What the fixed wing's sensors share: a sample clock, a delay, an output that stands.
 
 A sensor looks at its clock every `look` seconds, samples every `period`, and
-lets each measurement out `delay` seconds later. Its model is one pure compiled
+lets each measurement out `delay` seconds later; one without delay and with a period
+of whole seconds is woken for its samples only. Its model is one pure compiled
 function of the aircraft's state, so a sensor's file holds that function, its
 configuration and little else.
 
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
-from systems.configuration import require_same_structure
+from systems.configuration import StructureChangedError, require_same_structure
 from systems.runway_frames import RunwayConfig
 from systems.signals.measurement import Layout, no_measurement
 from systems.signals.noise import standard_normals, stream_key
@@ -58,16 +59,25 @@ class RunwaySensor(LeafSystem):
     def __init__(self, config: Any, seed: int = 0, runway: RunwayConfig | None = None):
         super().__init__()
         self._config = config
+        self._event_period = self.look
         self.configure(config, seed, runway)
         self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
         output = self.DeclareDiscreteState(no_measurement(self.layout))
         self.DeclareDiscreteState(2 + self.capacity * (self.layout.size + 1))
         self.DeclareStateOutputPort("measurement", output)
-        self.DeclarePeriodicDiscreteUpdateEvent(self.look, 0.0, self._update)
+        # whole seconds lie on every grid, and without delay there is nothing to do in between
+        seldom = self._delay == 0.0 and config.period == round(config.period)
+        self._event_period = config.period if seldom else self.look
+        self.DeclarePeriodicDiscreteUpdateEvent(self._event_period, 0.0, self._update)
 
     def configure(self, config: Any, seed: int, runway: RunwayConfig | None = None) -> None:
         """Take a new configuration of the same period, a seed and a runway."""
         require_same_structure(self._config, config, "period")
+        if getattr(config, "delay", 0.0) > 0.0 and self._event_period > self.look:
+            raise StructureChangedError(
+                f"{type(config).__name__}.delay was 0 s in the diagram, where this sensor wakes "
+                f"every {self._event_period:g} s only: build a new diagram"
+            )
         self._config = config
         self._every = max(round(config.period / self.look), 1)
         self._delay = getattr(config, "delay", 0.0)

@@ -20,9 +20,10 @@ from systems.runway_frames import RunwayConfig
 from systems.signals.measurement import no_measurement
 from systems.signals.noise import standard_normals, stream_key, uniform
 from systems.signals.runway_measurement import (
-    ATTITUDE_PERIOD,
+    ACT_OFFSET,
     FIXED_WING_STATE,
     PICTURE,
+    PICTURE_PERIOD,
     enqueue,
     release,
 )
@@ -118,7 +119,7 @@ class RunwayTracker(LeafSystem):
 
     | event | when | what |
     |---|---|---|
-    | update | every 10 ms from 0 | takes a new picture, lets out after `delay` |
+    | update | every 40 ms from 5 ms | takes the new picture, lets out after `delay` |
     """
 
     def __init__(
@@ -131,7 +132,7 @@ class RunwayTracker(LeafSystem):
         output = self.DeclareDiscreteState(no_measurement(PICTURE))
         self.DeclareDiscreteState(2 + _CAPACITY * (PICTURE.size + 1))
         self.DeclareStateOutputPort("measurement", output)
-        self.DeclarePeriodicDiscreteUpdateEvent(ATTITUDE_PERIOD, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(PICTURE_PERIOD, ACT_OFFSET, self._update)
 
     def configure(
         self, config: RunwayTrackerConfig, seed: int, runway: RunwayConfig | None = None

@@ -8,7 +8,7 @@ The clock is the one of the thesis (Leonard 2016, Tables 3 and 21): 100, 50 and
 25 Hz, periods of 10 ms times powers of two, which are exact multiples of each
 other in floating point. The laser's 10 Hz and the antenna's 1 or 2 Hz are
 counted on the 20 or 40 ms grid by the sensor's own sample clock. This vehicle shares
-no diagram with the multirotor, whose grid is 2 ms times powers of two.
+no diagram with the multirotor.
 
 | phase | offset | who, in order of cause |
 |---|---|---|

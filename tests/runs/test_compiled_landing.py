@@ -16,7 +16,7 @@ from systems.sensors.runway_gps import RunwayGpsConfig
 from systems.sensors.runway_pixel_camera import RunwayPixelCameraConfig
 from systems.sensors.runway_tracker import RunwayTrackerConfig
 
-SHORT = FixedWingConfig(start=[0.0, -1500.0, -158.9])
+SHORT = FixedWingConfig(start=[0.0, -1500.0, -154.1])
 BASE = LandingWithoutGpsScenario(time_limit=90.0, aircraft=SHORT)
 SCENARIOS = {
     "thesis's filter": BASE,

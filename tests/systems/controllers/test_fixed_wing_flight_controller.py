@@ -58,14 +58,16 @@ def test_landing_profile_is_a_slope_and_a_flare():
     s1 = math.tan(math.radians(6.0))
     far, slope = landing_altitude(5000.0, PROFILE)
     assert slope == pytest.approx(s1)
-    assert far - 1.2 == pytest.approx(5000.0 * s1)  # the slope aims at the point itself
-    beyond = 0.5 * (1.0 - 0.5 / 33.0 / s1) * 105.0
-    assert landing_altitude(-beyond, PROFILE)[0] == pytest.approx(1.2)
-    assert landing_altitude(-beyond, PROFILE)[1] * 33.0 == pytest.approx(0.5)
+    short = 0.5 * (1.0 - 0.5 / 33.0 / s1) * 105.0
+    assert far - 1.2 == pytest.approx((5000.0 - short) * s1)  # the slope aims short of the point
+    assert landing_altitude(0.0, PROFILE)[0] == pytest.approx(1.2)  # where the wheels touch
+    assert landing_altitude(0.0, PROFILE)[1] * 33.0 == pytest.approx(0.5)
     # the altitude is the integral of the slope
-    edge = 105.0 - beyond
-    risen = quad(lambda d: landing_altitude(d, PROFILE)[1], -beyond, 5000.0, points=[edge])[0]
+    risen = quad(lambda d: landing_altitude(d, PROFILE)[1], 0.0, 5000.0, points=[105.0])[0]
     assert far - 1.2 == pytest.approx(risen, rel=1e-6)
+    # an error of the height makes one along the runway that grows on the way in (Table 5)
+    near, farther = (landing_altitude(d, PROFILE)[0] / d for d in (100.0, 300.0))
+    assert farther / near > 1.3
     # Fig. 30: the laser's 100 m are about 1000 m before the touch-down point
     assert landing_altitude(1000.0, PROFILE)[0] == pytest.approx(105.0, abs=5.0)
 

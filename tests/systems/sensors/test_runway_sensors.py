@@ -144,13 +144,13 @@ def test_camera_sees_the_touchdown_point_on_its_axis():
 
 
 def test_camera_harmonisation_spreads():
-    """Yaw and pitch errors of 0.3 deg spread the picture by 6 px over the seeds."""
+    """Yaw and pitch errors of 0.25 deg spread the picture by 5 px over the seeds."""
     config = RunwayCameraConfig(position_spread=0.0)
     pixels = [
         arrivals(RunwayCamera(config, seed), {"state": state(pitch=-0.05)}, 0.02)[0, 4:6]
         for seed in range(120)
     ]
-    np.testing.assert_allclose(np.std(pixels, axis=0), 6.0, rtol=0.2)
+    np.testing.assert_allclose(np.std(pixels, axis=0), 5.0, rtol=0.2)
 
 
 def picture(u=320.0, v=240.0, validity=0.0) -> np.ndarray:
@@ -191,7 +191,7 @@ def test_latencies_of_camera_and_vision_chain():
     config = RunwayTrackerConfig(delay=0.2)
     out = track(config, 500.0, seen=picture(validity=0.1))
     assert out[0, 0] == pytest.approx(0.1)
-    assert out[0, 1] == pytest.approx(0.3)
+    assert out[0, 1] == pytest.approx(0.325)  # the first of its events from 0.3 s on
 
 
 def test_false_lock_and_outliers():
