@@ -1,4 +1,4 @@
-"""`plumbline`: land, replay, study, graph, scenarios.
+"""`plumbline`: land, replay, study, falsify, sensitivity, graph, scenarios.
 
 Exit status: 0 landed (or done), 1 not landed, 2 wrong input, told in one sentence.
 Heavy modules are imported inside the commands so that `--help` answers at once.
@@ -157,6 +157,7 @@ def scenarios(name: str | None) -> None:
 @click.argument("words", nargs=-1, metavar="NAME | resume DIR")
 @click.option("--list", "list_", is_flag=True, help="List the studies.")
 @click.option("--runs", type=click.IntRange(min=1), help="Landings, all variants together.")
+@click.option("--quick", is_flag=True, help="A look of minutes: fewer cells, fewer landings.")
 @click.option("--workers", type=click.IntRange(min=0), help="Processes.  [default: one a core]")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the campaign.")
 @click.option(
@@ -169,6 +170,7 @@ def study(
     words: tuple[str, ...],
     list_: bool,
     runs: int | None,
+    quick: bool,
     workers: int | None,
     seed: int | None,
     out: Path | None,
@@ -176,7 +178,7 @@ def study(
 ) -> None:
     """Fly the study NAME (or a YAML file), or go on with the campaign in DIR."""
     from studies.campaign import resume, run_study
-    from studies.study import StudyError, list_studies
+    from studies.study import StudyError, list_studies, load_study
 
     if list_:
         known = list_studies()
@@ -189,8 +191,10 @@ def study(
             case ("resume", campaign):
                 result = resume(Path(campaign), workers, scheduler)
             case (name,) if name != "resume":
-                folder = out or Path("out") / "studies" / Path(name).stem
-                result = run_study(name, folder, runs, workers, seed, scheduler)
+                chosen = load_study(name).quick_look() if quick else load_study(name)
+                own = f"{chosen.name}-quick" if quick else Path(name).stem
+                folder = out or Path("out") / "studies" / own
+                result = run_study(chosen, folder, runs, workers, seed, scheduler)
             case _:
                 raise WrongInput("study: expected the NAME of a study, or: resume DIR")
     except StudyError as error:
@@ -200,6 +204,207 @@ def study(
         click.echo(f"To go on: plumbline study resume {result.folder}")
     click.echo(f"Report: {result.folder / 'report.html'}")
     sys.exit(0 if result.complete else 1)
+
+
+def _search_options(command: Callable) -> Callable:
+    """What the searches over disturbances have in common."""
+    for option in (
+        click.option(
+            "--vary",
+            metavar="NAME,NAME…",
+            help="Disturbances, see --list.  [default: wind,gust,latency,dropout,drops]",
+        ),
+        click.option(
+            "--limit",
+            "limits",
+            metavar="NAME=VALUE",
+            multiple=True,
+            help="Another limit of a disturbance, e.g. --limit wind=10; repeatable.",
+        ),
+        click.option("--list", "list_", is_flag=True, help="List the disturbances."),
+        click.option(
+            "--fidelity",
+            type=click.Choice(["pixels", "geometric"]),
+            default="geometric",
+            show_default=True,
+            help="Cameras by real images or by an error model.",
+        ),
+        click.option(
+            "--seed",
+            type=click.IntRange(min=0),
+            default=1,
+            show_default=True,
+            help="Of the search and its flights.",
+        ),
+        click.option(
+            "--workers", type=click.IntRange(min=0), help="Processes.  [default: one a core]"
+        ),
+    ):
+        command = option(command)
+    return _scenario_options(command)
+
+
+@cli.command()
+@_search_options
+@click.option("--budget", type=click.IntRange(min=1), default=300, show_default=True)
+@click.option(
+    "--miss",
+    type=float,
+    default=0.5,
+    show_default=True,
+    help="m; a landing farther off is spoiled.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(min=1),
+    default=3,
+    show_default=True,
+    help="Flights that judge a case; it is spoiled if most of them are.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder.  [default: out/falsify/SCENARIO]"
+)
+def falsify(
+    scenario: str,
+    overrides: tuple[str, ...],
+    vary: str | None,
+    limits: tuple[str, ...],
+    list_: bool,
+    fidelity: str,
+    seed: int,
+    workers: int | None,
+    budget: int,
+    miss: float,
+    seeds: int,
+    out: Path | None,
+) -> None:
+    """Search for the mildest disturbance that spoils the landing of SCENARIO.
+
+    Writes it as a scenario, case.yaml, with a report. Ctrl-C leaves the best case so far; the same
+    command goes on.
+    """
+    if list_:
+        _list_disturbances()
+        return
+    from studies.falsification import DEFAULT_DISTURBANCES
+    from studies.falsification import falsify as search
+    from studies.study import StudyError
+
+    folder = _writable_folder(out or Path("out") / "falsify" / Path(scenario).stem)
+    try:
+        finding = search(
+            scenario,
+            folder,
+            _names(vary, DEFAULT_DISTURBANCES),
+            budget,
+            overrides=_flight_overrides(scenario, overrides, fidelity),
+            limits=_limits(limits),
+            miss=miss,
+            seeds=seeds,
+            seed=seed,
+            workers=workers,
+        )
+    except StudyError as error:
+        raise WrongInput(str(error)) from None
+    click.echo(finding.sentence())
+    if finding.interrupted:
+        click.echo(f"Interrupted after {finding.asked} flights; the same command goes on")
+    if finding.best is not None:
+        click.echo(f"To fly it: plumbline land {folder / 'case.yaml'}")
+    click.echo(f"Report: {folder / 'report.html'}")
+    sys.exit(1 if finding.interrupted else 0)
+
+
+@cli.command()
+@_search_options
+@click.option("--runs", type=click.IntRange(min=1), default=300, show_default=True)
+@click.option(
+    "--method", type=click.Choice(["morris", "sobol"]), default="morris", show_default=True
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder.  [default: out/sensitivity/SCENARIO]"
+)
+def sensitivity(
+    scenario: str,
+    overrides: tuple[str, ...],
+    vary: str | None,
+    limits: tuple[str, ...],
+    list_: bool,
+    fidelity: str,
+    seed: int,
+    workers: int | None,
+    runs: int,
+    method: Any,
+    out: Path | None,
+) -> None:
+    """Rank the disturbances by what they do to the landing of SCENARIO.
+
+    Ctrl-C keeps what is flown; the same command goes on.
+    """
+    if list_:
+        _list_disturbances()
+        return
+    from studies.falsification import DEFAULT_DISTURBANCES
+    from studies.sensitivity import analyse
+    from studies.study import StudyError
+
+    folder = _writable_folder(out or Path("out") / "sensitivity" / Path(scenario).stem)
+    try:
+        analysis = analyse(
+            scenario,
+            folder,
+            _names(vary, DEFAULT_DISTURBANCES),
+            runs,
+            method,
+            overrides=_flight_overrides(scenario, overrides, fidelity),
+            limits=_limits(limits),
+            seed=seed,
+            workers=workers,
+        )
+    except StudyError as error:
+        raise WrongInput(str(error)) from None
+    if analysis is None:
+        click.echo("Interrupted; the same command goes on")
+        sys.exit(1)
+    for sentence in analysis.sentences():
+        click.echo(sentence)
+    click.echo(f"Report: {folder / 'report.html'}")
+
+
+def _names(text: str | None, default: tuple[str, ...]) -> list[str]:
+    """The names of a list with commas."""
+    if text is None:
+        return list(default)
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _flight_overrides(scenario: str, overrides: tuple[str, ...], fidelity: str) -> dict[str, Any]:
+    """The overrides of every flight of a search, once the scenario has been found valid."""
+    from diagrams.loading import parse_overrides
+
+    loaded = _load(scenario, overrides)
+    cameras = {"fidelity": fidelity} if hasattr(loaded, "fidelity") else {}
+    return {**cameras, **parse_overrides(overrides)}
+
+
+def _limits(texts: tuple[str, ...]) -> dict[str, float]:
+    limits = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            limits[name.strip()] = float(value)
+        except ValueError:
+            raise WrongInput(f"--limit {text}: expected NAME=NUMBER, as in wind=10") from None
+    return limits
+
+
+def _list_disturbances() -> None:
+    from studies.disturbances import DISTURBANCES
+
+    width = max(len(name) for name in DISTURBANCES)
+    for name, entry in DISTURBANCES.items():
+        unit = f" ({entry.unit})" if entry.unit else ""
+        click.echo(f"{name:{width}}  {entry.text}{unit}; limit: {entry.source}")
 
 
 @cli.command()

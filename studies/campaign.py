@@ -180,7 +180,7 @@ def _fly(ledger: Ledger, workers: int | None, scheduler: str | None, progress: b
         count = default_workers() if workers is None else workers
         with (
             closing(make_executor(count, scheduler)) as executor,
-            _stop_on_signal() as stopping,
+            stop_on_signal() as stopping,
             _progress(study, ledger.runs, len(done), progress) as advance,
         ):
 
@@ -205,7 +205,7 @@ def _write(ledger: Ledger) -> StudyResult:
 
 
 @contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
+def stop_on_signal() -> Iterator[threading.Event]:
     """An event that Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
     stopping = threading.Event()
     if threading.current_thread() is not threading.main_thread():

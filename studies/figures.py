@@ -16,8 +16,11 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -62,6 +65,9 @@ STYLE: dict[Any, Any] = {
 }
 TITLE_WIDTH = 30  # characters over a panel of touchdown points
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))  # within one colour
+HEAT = "YlOrRd"  # of maps, from little to much
+HEAT_LIMITS = (2.0, 300.0)  # cm, of its colours
+HEAT_DARK = 45.0  # cm, above which a colour asks for white text
 RASTER_LIMIT = 1500  # points of a panel, above which they are drawn as one image
 
 
@@ -205,10 +211,54 @@ def curve(
     high: Sequence[float],
     label: str,
     colour: str,
+    dashes: Any = "-",
 ) -> None:
     """A number over a grid, with the band of its interval; missing bounds leave gaps."""
-    axes.fill_between(at, low, high, color=colour, alpha=0.18, lw=0)
-    axes.plot(at, value, color=colour, lw=1.6, marker="o", ms=4, label=label)
+    axes.fill_between(at, low, high, color=colour, alpha=0.14, lw=0)
+    axes.plot(at, value, color=colour, lw=1.6, ls=dashes, marker="o", ms=3.5, label=label)
+
+
+def heat_map(
+    axes: Axes,
+    values: NDArray[np.float64],
+    texts: NDArray[Any],
+    rows: Sequence[str],
+    columns: Sequence[str],
+) -> ScalarMappable:
+    """Numbers as colours on one logarithmic scale for all maps, each with its text.
+
+    Parameters
+    ----------
+    values : array of shape (rows, columns)
+        In cm, say; nan leaves a field empty.
+    texts : array of str, shape (rows, columns)
+    rows, columns : sequence of str
+        Names of the fields, the first row at the top.
+    """
+    shown = axes.imshow(
+        np.ma.masked_invalid(values), cmap=HEAT, norm=LogNorm(*HEAT_LIMITS), aspect="auto"
+    )
+    for (i, j), text in np.ndenumerate(texts):
+        if text:
+            dark = np.isfinite(values[i, j]) and values[i, j] > HEAT_DARK
+            colour = "#ffffff" if dark else "#15181d"
+            axes.text(
+                j, i, text, color=colour, fontsize=7.5, ha="center", va="center", linespacing=0.95
+            )
+    axes.set_xticks(range(len(columns)), columns)
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(labelsize=8, colors=INK)
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return shown
+
+
+def plain_numbers(axis: Axis) -> None:
+    """1, 2, 5, 10 on a logarithmic axis instead of powers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def figure(width: float, height: float) -> Figure:
@@ -271,6 +321,4 @@ def _box(axes: Axes, line: int, values: NDArray[np.float64], colour: str) -> Non
 
 def _logarithmic(axes: Axes) -> None:
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(axes.xaxis)

@@ -2,9 +2,10 @@
 
     python -m studies.pages out/studies/infrared-and-marker [MORE FOLDERS] [--docs docs]
 
-Every folder of a campaign of study NAME leaves `docs/data/NAME.csv` (its rows, rounded) and
-`docs/data/NAME-*.svg`, and fills the block of each page that asks for it,
-``<!-- campaign NAME -->`` to ``<!-- end -->``. The words around the blocks are written by hand.
+Every folder of a campaign of study NAME leaves `docs/data/NAME.csv` (its rows, rounded; of a study
+with axes its cells, with intervals) and `docs/data/NAME-*.svg`, and fills the block of each page
+that asks for it, ``<!-- campaign NAME -->`` to ``<!-- end -->``. The words around the blocks are
+written by hand.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from studies import figures
+from studies import figures, maps
 from studies.campaign import summarise_again
 from studies.published import PUBLISHED
 from studies.report import samples
@@ -34,8 +35,11 @@ def write(folder: Path, docs: Path) -> None:
     table = with_measures(study, result.table)
     data = docs / "data"
     data.mkdir(parents=True, exist_ok=True)
-    kept = ["run", "condition", *study.measures.columns()]
-    table[kept].round(DECIMALS).to_csv(data / f"{study.name}.csv", index=False)
+    if study.axes:
+        rows = maps.cell_table(study, result.summary)
+    else:
+        rows = table[["run", "condition", *study.measures.columns()]]
+    rows.round(DECIMALS).to_csv(data / f"{study.name}.csv", index=False)
     _draw(study, table, result.summary, data)
     text = tables(study, table, result.summary)
     block = re.compile(
@@ -52,13 +56,17 @@ def tables(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> str
     """The figures and tables of a campaign as Markdown."""
     counts = [condition["runs"] for condition in summary["conditions"]]
     many = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
+    place = "cell" if study.axes else "row"
     lines = [
-        f"{summary['done']} landings, {many} a row (the study asks for {study.runs}); "
+        f"{summary['done']} landings, {many} a {place} (the study asks for {study.runs}); "
         f"campaign seed {study.seed}. Intervals: 95 %.",
         "",
-        f"![Landing error by row](data/{study.name}-error.svg)",
-        "",
     ]
+    if study.axes:
+        figure, cells = f"data/{study.name}-cells.svg", f"data/{study.name}.csv"
+        lines += maps.markdown_lines(study, table, summary, figure, cells)
+        return "\n".join(lines)
+    lines += [f"![Landing error by row](data/{study.name}-error.svg)", ""]
     lines += (
         _published(study, summary)
         if summary["published"]
@@ -125,16 +133,19 @@ def _distributions(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]
 
 
 def _draw(study: Study, table: pd.DataFrame, summary: Mapping[str, Any], data: Path) -> None:
-    """Box plots of the error, published trials beside them, on white."""
+    """The errors on white: by cell, or box plots with published trials beside them."""
     column = study.measures.error
     title, unit, scale = scale_of(column, summary)
     with figures.style():
-        shown = samples(study, table, column, scale)
-        made = figures.figure(9.4, 0.9 + 0.42 * len(shown))
-        wide = all((sample.values > 0.0).all() and np.size(sample.values) for sample in shown)
-        figures.boxes(made.subplots(), shown, f"{title} ({unit})", logarithmic=wide)
+        if study.axes:
+            name, made = "cells", maps.draw(study, summary)
+        else:
+            shown = samples(study, table, column, scale)
+            name, made = "error", figures.figure(9.4, 0.9 + 0.42 * len(shown))
+            wide = all((sample.values > 0.0).all() and np.size(sample.values) for sample in shown)
+            figures.boxes(made.subplots(), shown, f"{title} ({unit})", logarithmic=wide)
         made.savefig(
-            data / f"{study.name}-error.svg",
+            data / f"{study.name}-{name}.svg",
             facecolor="white",
             metadata={"Date": None, "Creator": None},
         )

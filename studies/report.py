@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from studies import figures
+from studies import figures, maps
 from studies.figures import Sample
 from studies.ledger import write_durably
 from studies.published import INCONSISTENCIES, SIGNIFICANCE, PublishedTrials
@@ -34,7 +34,7 @@ MOST_CURVES = 8  # in one plot of tails
 def write_report(
     study: Study, table: pd.DataFrame, summary: Mapping[str, Any], folder: Path
 ) -> None:
-    """Write `report.html` of a summarised campaign."""
+    """Write `report.html` of a summarised campaign, and `cells.csv` if its study has axes."""
     template = (resources.files("studies") / "report.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
@@ -53,6 +53,9 @@ def write_report(
         significance=f"{100 * SIGNIFICANCE:g} %",
     )
     write_durably(folder / "report.html", html.encode())
+    if study.axes:
+        cells = maps.cell_table(study, summary).to_csv(index=False)
+        write_durably(folder / "cells.csv", cells.encode())
 
 
 def samples(study: Study, table: pd.DataFrame, column: str, scale: float) -> list[Sample]:
@@ -93,6 +96,8 @@ def _figures(
     """Title, explanation and SVG of each figure that has something to show."""
     if not summary["successes"]:
         return []
+    if study.axes:
+        return [_by_cell(study, table, summary)]
     drawn = []
     diamonds = " Diamonds: the published trials." if summary["published"] else ""
     measures = study.measures
@@ -122,6 +127,21 @@ def _figures(
     if len(study.grids) == 1 and _numeric(next(iter(study.grids.values()))):
         drawn.append(_over_grid(study, summary))
     return drawn
+
+
+def _by_cell(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> tuple[str, str, str]:
+    told = " ".join(
+        [
+            *(text.replace("*", "") for text in maps.sentences(study, table)),
+            *(maps.rule(budget) for budget in study.budgets),
+        ]
+    )
+    return (
+        "Mean error by cell",
+        "Means of the runs that succeeded, and how many those are where it is fewer than "
+        f"{100 * maps.SURE:g} %. {told} Every cell with its intervals: cells.csv.",
+        figures.to_svg(maps.draw(study, summary), "Mean landing error by cell"),
+    )
 
 
 def _touchdowns(

@@ -64,7 +64,7 @@ def summarise(study: Study, table: pd.DataFrame, runs: int, folder: Path) -> dic
             _condition(study, condition, table[table["condition"].eq(condition.label)])
             for condition in study.conditions
         ],
-        "paired": _paired(study, landed),
+        "paired": [] if study.axes else _paired(study, landed),  # maps compare by cell
         "published": [
             dataclasses.asdict(comparison)
             | {"agrees": comparison.agrees, "verdict": comparison.verdict}

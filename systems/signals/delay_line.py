@@ -18,6 +18,7 @@ from pydrake.systems.framework import (
 )
 
 from systems.configuration import (
+    Positive,
     Probability,
     Seconds,
     configuration,
@@ -33,7 +34,7 @@ from systems.signals.measurement import (
 )
 from systems.signals.noise import standard_normal, stream_key, uniform
 
-_FIXED, _UNIFORM, _NORMAL, _RECORDED = range(4)
+_FIXED, _UNIFORM, _NORMAL, _RECORDED, _ROLLING = range(5)
 
 
 @configuration
@@ -92,8 +93,29 @@ class RecordedLatency:
         return [_RECORDED, 0.0, 0.0, *self.times]
 
 
+@configuration
+class RollingLatency:
+    """A sine over the measurements, as of two clocks that beat; its phase is drawn once a run."""
+
+    kind: Literal["rolling"] = "rolling"
+    mean: Seconds = 0.0  # s
+    amplitude: Seconds = 0.0  # s, at most the mean
+    turn: Positive = 60.0  # measurements from one crest to the next
+
+    @model_validator(mode="after")
+    def _check_amplitude(self) -> Any:
+        if self.amplitude > self.mean:
+            raise ValueError(f"amplitude {self.amplitude} s is more than the mean {self.mean} s")
+        return self
+
+    def parameters(self) -> list[float]:
+        """The model as `draw_latency` reads it."""
+        return [_ROLLING, self.mean, self.amplitude, self.turn]
+
+
 LatencyModel = Annotated[
-    FixedLatency | UniformLatency | NormalLatency | RecordedLatency, Field(discriminator="kind")
+    FixedLatency | UniformLatency | NormalLatency | RecordedLatency | RollingLatency,
+    Field(discriminator="kind"),
 ]
 
 
@@ -137,8 +159,9 @@ def draw_latency(parameters, key, sequence_number, copy):
 
     Parameters
     ----------
-    parameters : array of shape (7 + number of recorded latencies,)
-        Model, its two numbers, constant part (s), drop, duplicate, in order, recorded latencies.
+    parameters : array of shape (7 + further numbers of the model,)
+        Model, its two numbers, constant part (s), drop, duplicate, in order, then the recorded
+        latencies or the measurements of a turn.
     key : np.uint64
         Of the stream of latencies.
     sequence_number : int
@@ -157,6 +180,9 @@ def draw_latency(parameters, key, sequence_number, copy):
             drawn = a + b * standard_normal(key, sequence_number, lane)
     elif model == _RECORDED:
         drawn = parameters[_TIMES + (sequence_number + copy) % (parameters.size - _TIMES)]
+    elif model == _ROLLING:
+        turns = sequence_number / parameters[_TIMES] + uniform(key, 0, 0)
+        drawn = a + b * math.sin(2.0 * math.pi * turns)
     return parameters[_CONSTANT] + drawn
 
 
@@ -269,7 +295,7 @@ class DelayLine(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | discrete update | every `period` (10 ms by default) from 0 | enter, release |
+    | update | every `period` (10 ms by default) from 0 | enter, release |
 
     A consumer sees a release one period of its own later, like everything that happens
     on one tick.

@@ -54,6 +54,7 @@ FAULT_COMMAND = Layout(
 )
 
 _RANDOM, _PERIODIC, _ALWAYS, _BELOW, _ABOVE, _BIAS, _FREEZE, _FALSE_BLOB, _BEARING_SHIFT = range(9)
+_OUTLIER = 9
 
 
 @configuration
@@ -121,10 +122,12 @@ class BelowDrop(_Fault):
 
     kind: Literal["below"] = "below"
     height: Finite = 3.0  # m, of the body's origin above the pad's centre
+    duration: Seconds | None = None  # s from the first drop, once in a run; None as long as below
 
     def rows(self, layout: Layout) -> list[list[float]]:
         """The fault as `inject` reads it."""
-        return [self._row(_BELOW, self.height)]
+        duration = math.inf if self.duration is None else self.duration
+        return [self._row(_BELOW, self.height, duration)]
 
 
 @configuration
@@ -212,6 +215,26 @@ class FalseTarget(_Fault):
         raise ValueError(f"false_target: a {layout.name} has no bearing to a target")
 
 
+@configuration
+class Outlier(_Fault):
+    """Some measurements point elsewhere: by a fixed angle, in a direction drawn for each.
+
+    All blobs of an infrared measurement are shifted alike; a marker measurement that is
+    valid has its bearing turned, its corners stay.
+    """
+
+    kind: Literal["outlier"] = "outlier"
+    probability: Probability = 0.1  # that a measurement is an outlier
+    size: NonNegative = 0.1  # 1, shift of the tangents x/z and y/z in C
+
+    def rows(self, layout: Layout) -> list[list[float]]:
+        """The fault as `inject` reads it; raises `ValueError` if `layout` has no bearing."""
+        if layout.name not in (INFRARED.name, MARKER.name):
+            raise ValueError(f"outlier: a {layout.name} has no bearing to a target")
+        blobs = layout.name == INFRARED.name
+        return [self._row(_OUTLIER, self.probability, self.size, blobs)]
+
+
 Fault = Annotated[
     RandomDrop
     | PeriodicDrop
@@ -221,7 +244,8 @@ Fault = Annotated[
     | WindowsDrop
     | Bias
     | Freeze
-    | FalseTarget,
+    | FalseTarget
+    | Outlier,
     Field(discriminator="kind"),
 ]
 
@@ -293,6 +317,15 @@ def _turn_bearing(measurement, dx, dy):
 
 
 @njit(cache=True)
+def _shift_blobs(measurement, dx, dy):
+    if measurement[VALID] == 0.0:
+        return
+    for i in range(int(measurement[_COUNT])):
+        measurement[_BLOB + 3 * i] += dx
+        measurement[_BLOB + 3 * i + 1] += dy
+
+
+@njit(cache=True)
 def _in_drop_phase(count, keep, drop):
     """Whether the value after `count` others is dropped: `keep` are kept, then `drop` dropped."""
     return drop > 0.0 and count % (keep + drop) >= keep
@@ -348,7 +381,10 @@ def inject(time, measurement, height, attempts, landing_started, rows, keys, out
         elif kind == _ALWAYS:
             dropped = True
         elif kind == _BELOW:
-            dropped |= height <= row[_A]
+            if height <= row[_A]:
+                if memory[_COUNTERS + i] == 0.0:
+                    memory[_COUNTERS + i] = time
+                dropped |= time - memory[_COUNTERS + i] < row[_B]
         elif kind == _ABOVE:
             dropped |= height >= row[_A]
         elif kind == _BIAS:
@@ -361,6 +397,13 @@ def inject(time, measurement, height, attempts, landing_started, rows, keys, out
             _add_blob(measurement, row[_A], row[_B], row[_C], row[_D] != 0.0)
         elif kind == _BEARING_SHIFT:
             _turn_bearing(measurement, row[_A], row[_B])
+        elif kind == _OUTLIER and uniform(keys[0], number, i) < row[_A]:
+            angle = 2.0 * math.pi * uniform(keys[0], number, MAXIMUM_ROWS + i)
+            dx, dy = row[_B] * math.cos(angle), row[_B] * math.sin(angle)
+            if row[_C] != 0.0:
+                _shift_blobs(measurement, dx, dy)
+            else:
+                _turn_bearing(measurement, dx, dy)
     if not frozen or memory[_HAS_HELD] == 0.0:
         memory[_HELD:] = untouched
         memory[_HAS_HELD] = 1.0
@@ -411,12 +454,13 @@ class FaultInjector(LeafSystem):
         random      dropped if u(seed, stream, n) < probability
         periodic    dropped if count mod (keep + drop) ≥ keep
         permanent   dropped
-        below       dropped if h ≤ height,  h = p_WB.z − p_WP.z
+        below       dropped if h ≤ height,  h = p_WB.z − p_WP.z,  for `duration` at most
         above       dropped if h ≥ height
         windows     dropped if start ≤ t < end of one of them
         bias        field += offset
         freeze      fields and valid flag := those before the first frozen measurement
         false_target  a blob more, or bearing (x/z, y/z) += (dx, dy)
+        outlier     with `probability` all bearings += size (cos φ, sin φ),  φ = 2π u(seed, n)
 
     A command has the meaning of the message in "Precision landing with infrared and
     marker sensors", section 7.2 and table 1: if its `target` has this sensor's bit,
@@ -426,13 +470,13 @@ class FaultInjector(LeafSystem):
     ignored. A command has no say over the configured faults. Commands must be at
     least one period apart.
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | `period`, 10 ms by default | 0 | obeys, passes, drops |
+    | event | when | does |
+    |---|---|---|
+    | update | every `period` (10 ms by default) from 0 | obeys, passes, drops |
 
-    The sensor's sample at t passes at t + period: blocks of one phase see each
-    other late. A `DelayLine` behind the injector absorbs that, because it counts
-    latency from the time of validity.
+    The sensor's sample at t passes at t + period, as from any block to another. A
+    `DelayLine` behind the injector absorbs that, because it counts latency from
+    the time of validity.
 
     Parameters
     ----------

@@ -81,6 +81,7 @@ def test_not_landed_ends_with_1(tmp_path):
         (["graph", "--out", "wiring.pdf"], ["dot, svg, png"]),
         (["study", "infrared-and-markr"], ["infrared-and-marker"]),
         (["study"], ["expected the NAME of a study"]),
+        (["study", "infrared-and-marker", "--quick"], ["infrared-and-marker", "no quick look"]),
         (["study", "resume", "nowhere"], ["nowhere"]),
         (["land", "--from", "nowhere/3"], ["nowhere"]),
     ],

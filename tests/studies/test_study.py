@@ -1,13 +1,25 @@
 import dataclasses
 import pickle
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from diagrams.loading import load_scenario
+from diagrams.loading import load_scenario, with_overrides
 from studies.published import PUBLISHED
 from studies.sampling import Choice, Uniform
-from studies.study import Study, StudyError, Variant, list_studies, load_study, study_names
+from studies.study import (
+    Axis,
+    Budget,
+    Level,
+    Quick,
+    Study,
+    StudyError,
+    Variant,
+    list_studies,
+    load_study,
+    study_names,
+)
 
 
 @pytest.fixture
@@ -169,8 +181,9 @@ def test_every_condition_of_every_study_is_a_scenario(name: str):
     study = load_study(name)
     assert study.name == name
     assert study.description
-    for spec in study.run_specs(2 * len(study.conditions)):
-        load_scenario(study.scenario, spec.overrides)
+    base = load_scenario(study.scenario)
+    for spec in study.run_specs(study.runs_of(1)):
+        with_overrides(base, spec.overrides)
 
 
 def test_the_thesis_study_holds_every_row_of_its_tables():
@@ -184,3 +197,174 @@ def test_the_thesis_study_holds_every_row_of_its_tables():
         flown = variant.overrides.get("guidance.mission.altitude", 10.0)
         # Table 4 says 6 m of one row; section 8.2.2 and its landing times say 10 m.
         assert flown == (10.0 if row.table == "Table 15" else row.initial_height)
+
+
+@pytest.fixture
+def mapped() -> Study:
+    return Study(
+        name="map",
+        scenario="default",
+        overrides={"camera.faults": [{"kind": "below"}], "beacon": None},
+        variants={
+            "seeing": Variant(label="Seeing", overrides={"gate": 3.0}),
+            "blind": Variant(overrides={"camera": None}, every=2),
+            "gateless": Variant(lacks=["gate"]),
+        },
+        axes={
+            "length": Axis(
+                label="blind for (s)",
+                levels={
+                    "0": Level(label="never blind", overrides={"camera.faults": []}),
+                    "2": Level(overrides={"camera.faults.0.duration": 2.0}),
+                    "4": Level(overrides={"camera.faults.0.duration": 4.0}, every=3),
+                },
+            ),
+            "gate": Axis(values=[100, 300], paths={"gate": 0.01, "beacon.gate": 1.0}),
+        },
+        distributions={"wind.speed": Uniform(low=0.0, high=5.0)},
+        quick=Quick(runs=7, levels={"length": ["0", "4"], "gate": ["300"]}),
+        budgets=[Budget(axis="length")],
+    )
+
+
+def test_cells_that_fly_the_same_are_flown_once(mapped: Study):
+    assert len(mapped.cells) == 3 * 3 * 2
+    flown = {name: [c for c in mapped.conditions if c.variant == name] for name in mapped.variants}
+    assert len(flown["seeing"]) == 6
+    assert len(flown["gateless"]) == 3  # it has no gate
+    assert len(flown["blind"]) == 2  # no camera: all lengths alike
+    shown = {id(cell.condition) for cell in mapped.cells}
+    assert shown == {id(condition) for condition in mapped.conditions}
+    assert len({condition.label for condition in mapped.conditions}) == len(mapped.conditions)
+
+
+def test_levels_set_scaled_numbers_over_the_variants_and_leave_out_what_is_not_there(mapped):
+    cells = {(cell.variant, *cell.levels.values()): cell.condition for cell in mapped.cells}
+    assert cells["seeing", "2", "300"].overrides == {
+        "camera.faults": [{"kind": "below"}],
+        "camera.faults.0.duration": 2.0,
+        "beacon": None,
+        "gate": 3.0,
+    }
+    assert cells["seeing", "2", "100"].overrides["gate"] == 1.0
+    assert cells["seeing", "2", "300"].label == "Seeing, length 2, gate 300"
+    assert cells["seeing", "0", "300"].label == "Seeing, never blind, gate 300"
+    assert cells["blind", "2", "300"].overrides == cells["blind", "0", "300"].overrides
+    assert "camera.faults.0.duration" not in cells["blind", "2", "300"].overrides
+
+
+def test_a_value_for_a_whole_field_voids_what_was_said_of_its_parts():
+    study = Study(
+        name="void",
+        scenario="default",
+        axes={
+            "turn": Axis(values=[1, 2], paths={"latency.turn": 1.0}),
+            "kind": Axis(
+                levels={
+                    "rolling": Level(),
+                    "fixed": Level(overrides={"latency": {"kind": "fixed"}}),
+                    "late": Level(overrides={"latency": {"mean": 0.2}}),
+                }
+            ),
+        },
+    )
+    assert [condition.overrides for condition in study.conditions] == [
+        {"latency.turn": 1.0},
+        {"latency": {"kind": "fixed"}},
+        {"latency.turn": 1.0, "latency": {"mean": 0.2}},
+        {"latency.turn": 2.0},
+        {"latency.turn": 2.0, "latency": {"mean": 0.2}},
+    ]
+
+
+def test_some_conditions_are_flown_more_rarely_but_with_the_same_worlds(mapped: Study):
+    specs = list(mapped.run_specs(mapped.runs_of(12)))
+    assert [spec.run for spec in specs] == list(range(len(specs)))
+    for condition in mapped.conditions:
+        pairs = [spec.pair for spec in specs if spec.condition is condition]
+        assert pairs == list(range(0, 12, condition.every))
+    rare = {cell.condition.every for cell in mapped.cells if cell.variant == "blind"}
+    assert rare == {2}  # all its lengths show the first one's runs
+    for pair in range(12):
+        members = [spec for spec in specs if spec.pair == pair]
+        assert len({(spec.seed, spec.varied["wind.speed"]) for spec in members}) == 1
+    assert list(mapped.run_specs(10)) == specs[:10]
+
+
+def test_a_study_with_axes_survives_json_and_its_cells_decide_its_seeds(mapped: Study):
+    copy = Study.from_json(mapped.to_json())
+    assert copy.digest == mapped.digest
+    assert copy.run_spec(7) == mapped.run_spec(7)
+    assert dataclasses.replace(mapped, layout="table", budgets=[]).digest == mapped.digest
+    axes = mapped.axes | {"gate": Axis(values=[100, 400], paths={"gate": 0.01})}
+    assert dataclasses.replace(mapped, axes=axes).digest != mapped.digest
+
+
+def test_a_quick_look_is_a_coarser_study(mapped: Study):
+    quick = mapped.quick_look()
+    assert quick.runs == 7
+    assert {tuple(cell.levels.values()) for cell in quick.cells} == {("0", "300"), ("4", "300")}
+    assert quick.digest != mapped.digest
+    with pytest.raises(StudyError, match="map has no quick look"):
+        dataclasses.replace(mapped, quick=None).quick_look()
+    wrong = dataclasses.replace(mapped, quick=Quick(runs=1, levels={"gate": ["5"]}))
+    with pytest.raises(StudyError, match="map: quick: there is no level '5'"):
+        wrong.quick_look()
+
+
+def test_cells_can_be_left_out(mapped: Study):
+    axes = {
+        "length": mapped.axes["length"],
+        "gate": dataclasses.replace(mapped.axes["gate"], without=["blind"]),
+    }
+    axes["length"].levels["2"].without = ["seeing"]
+    cells = {(c.variant, *c.levels.values()) for c in dataclasses.replace(mapped, axes=axes).cells}
+    assert ("blind", "0", "300") not in cells
+    assert ("blind", "0", "100") in cells
+    assert ("seeing", "2", "100") not in cells
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("axes: {a: {label: x}}", "axes.a: expected either levels or values"),
+        ("axes: {a: {values: [1]}}", "axes.a: expected values together with the paths"),
+        ("axes: {a: {values: [1], paths: {w: 1}}}\ngrids: {w: [1]}", "w is set by axes.a and by"),
+        ("axes: {a: {values: [1], paths: {w: 1}, without: [x]}}", "axes.a: there is no variant"),
+        ("budgets: [{axis: x}]", "budgets: there is no axis 'x'"),
+    ],
+)
+def test_wrong_axes_are_refused_in_one_sentence(tmp_path: Path, text: str, expected: str):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"scenario: d\n{text}\n")
+    with pytest.raises(StudyError, match=expected) as raised:
+        load_study(file)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", [name for name in study_names() if load_study(name).quick])
+def test_maps_and_league_fly_every_cell_200_times(name: str):
+    study = load_study(name)
+    conditions = study.conditions
+    flown = Counter(spec.condition.label for spec in study.run_specs())
+    assert min(flown[condition.label] for condition in conditions) == 200
+    quick = study.quick_look()
+    assert quick.runs >= len(quick.conditions)
+    assert quick.runs <= 600
+
+
+def test_the_league_shares_what_flies_the_same():
+    study = load_study("league-table")
+    cells = {(cell.variant, *cell.levels.values()): cell.condition for cell in study.cells}
+    assert all(
+        cells["normal", "5", fault] is cells["normal", "5", "none"]
+        for fault in ("random", "permanent", "false-beacon", "latency")
+    )
+    assert cells["infrared", "5", "marker-permanent"] is cells["infrared", "5", "none"]
+    assert cells["infrared", "5", "infrared-permanent"] is cells["infrared", "5", "permanent"]
+    assert cells["marker", "5", "false-beacon"] is cells["marker", "5", "none"]
+    assert cells["fused", "5", "marker-permanent"] is not cells["fused", "5", "permanent"]
+    flown = Counter(spec.condition.label for spec in study.run_specs())
+    for variant in study.variants:
+        runs = flown[cells[variant, "5", "none"].label]
+        assert runs == (200 if variant == "svgs" else 1000)

@@ -15,6 +15,7 @@ from systems.signals.delay_line import (
     FixedLatency,
     NormalLatency,
     RecordedLatency,
+    RollingLatency,
     UniformLatency,
     draw_latency,
 )
@@ -278,3 +279,29 @@ def test_refuses_impossible_figures():
         RecordedLatency(times=[])
     with pytest.raises(ValueError, match="drop"):
         DelayLineConfig(drop=1.5)
+
+
+def test_a_rolling_latency_is_a_sine_over_the_measurements():
+    config = RollingLatency(mean=0.16, amplitude=0.1, turn=12.5)
+    parameters = np.array([*config.parameters()[:3], 0.0, 0.0, 0.0, 1.0, config.turn])
+    drawn = np.array([draw_latency(parameters, stream_key(3, "line"), n, 0) for n in range(50)])
+    phase = 2.0 * np.pi * np.arange(50) / 12.5
+    design = np.column_stack((np.ones(50), np.sin(phase), np.cos(phase)))
+    (mean, *wave), residual, *_ = np.linalg.lstsq(design, drawn, rcond=None)
+    assert residual[0] < 1e-24
+    assert mean == pytest.approx(0.16)
+    assert np.hypot(*wave) == pytest.approx(0.1)
+    again = draw_latency(parameters, stream_key(4, "line"), 0, 0)
+    assert again != pytest.approx(drawn[0], abs=1e-6)  # another run, another phase
+
+
+def test_a_rolling_latency_is_never_negative():
+    with pytest.raises(ValidationError, match="is more than the mean"):
+        RollingLatency(mean=0.1, amplitude=0.2)
+
+
+def test_a_rolling_latency_reaches_the_consumer():
+    latency = RollingLatency(mean=0.1, amplitude=0.06, turn=40.0)
+    out = released(DelayLineConfig(latency=latency, order="by_release_time"))
+    taken = out[:, 1] - out[:, 0]
+    assert taken.min() < 0.06 < 0.14 < taken.max()

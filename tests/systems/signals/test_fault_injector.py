@@ -20,6 +20,7 @@ from systems.signals.fault_injector import (
     FaultInjector,
     FaultInjectorConfig,
     Freeze,
+    Outlier,
     PeriodicDrop,
     PermanentDrop,
     RandomDrop,
@@ -127,6 +128,17 @@ def test_below_and_above_are_complements_but_for_the_threshold():
     height = 6.0 - 4.0 * (PERIOD * np.arange(100) + 0.01 - 0.002)
     assert below == list(np.flatnonzero(height > 3.0))
     assert above == list(np.flatnonzero(height < 3.0))
+
+
+def test_below_for_a_while_is_one_gap():
+    fault = BelowDrop(height=3.0, duration=0.3)
+    kept = numbers(fault, count=100, body=falling(6.0, 4.0))
+    gap = sorted(set(range(100)) - set(kept))
+    assert len(gap) == 15  # 0.3 s of 50 Hz, and what is below 3 m after them passes
+    assert gap == list(range(gap[0], gap[0] + 15))
+    assert gap[0] == numbers(BelowDrop(height=3.0), count=100, body=falling(6.0, 4.0))[-1] + 1
+    none = BelowDrop(height=3.0, duration=0.0)
+    assert len(numbers(none, count=100, body=falling(6.0, 4.0))) == 100
 
 
 @pytest.mark.parametrize("fault", [BelowDrop(height=3.0), AboveDrop(height=3.0)])
@@ -447,3 +459,37 @@ def test_configure_changes_the_faults_but_not_the_period():
 def test_too_many_faults():
     with pytest.raises(ValueError, match="33 rows"):
         FaultInjector(FaultInjectorConfig(faults=[PermanentDrop()] * 33), layout=BAROMETER)
+
+
+def test_outliers_are_so_many_so_far_off_in_every_direction():
+    count, size = 600, 0.2
+    rows = samples(MARKER, PERIOD, count)
+    rows[:, MARKER.index("valid")] = 1.0
+    bearing = slice(MARKER.index("bearing_C_x"), MARKER.index("bearing_C_x") + 3)
+    rows[:, bearing] = 0.0, 0.0, 1.0
+    out = passed(Outlier(probability=0.3, size=size), rows=rows, layout=MARKER)[:, bearing]
+    shift = out[:, :2] / out[:, 2:]
+    wrong = shift[np.any(shift != 0.0, axis=1)]
+    assert stats.binomtest(len(wrong), count, 0.3).pvalue > 1e-3
+    np.testing.assert_allclose(np.hypot(*wrong.T), size, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1.0, rtol=1e-12)
+    angle = np.arctan2(wrong[:, 1], wrong[:, 0])
+    assert stats.kstest(angle, stats.uniform(-np.pi, 2.0 * np.pi).cdf).pvalue > 1e-3
+
+
+def test_an_infrared_outlier_shifts_all_blobs_alike():
+    rows = samples(INFRARED, PERIOD, 20)
+    first = INFRARED.index("blob_0_x")
+    rows[:, INFRARED.index("valid")], rows[:, INFRARED.index("count")] = 1.0, 2.0
+    rows[:, first:] = 0.0
+    rows[:, first + 3] = 0.1
+    out = passed(Outlier(probability=1.0, size=0.05), rows=rows, layout=INFRARED)
+    blobs = out[:, first : first + 6].reshape(-1, 2, 3)
+    np.testing.assert_allclose(np.hypot(*blobs[:, 0, :2].T), 0.05, rtol=1e-12)
+    np.testing.assert_allclose(blobs[:, 1, :2] - blobs[:, 0, :2], [[0.1, 0.0]] * 20, atol=1e-12)
+    assert not out[:, first + 6 :].any()
+
+
+def test_a_barometer_has_no_outliers_in_bearing():
+    with pytest.raises(ValueError, match="outlier: a BarometerMeasurement has no bearing"):
+        passed(Outlier(), layout=BAROMETER)

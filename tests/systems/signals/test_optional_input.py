@@ -50,3 +50,12 @@ def test_fixed_or_connected_it_is_the_port():
 def test_an_error_behind_a_connected_port_is_not_swallowed():
     with pytest.raises(RuntimeError, match="broken upstream"):
         read_from(Broken())
+
+
+def test_a_port_that_was_unconnected_may_be_fixed_and_cleared():
+    reader = Reader()
+    bare, fixed = reader.CreateDefaultContext(), reader.CreateDefaultContext()
+    reader.get_input_port().FixValue(fixed, [1.0, 2.0])
+    for _ in range(2):
+        assert reader.value(bare) is OTHERWISE
+        np.testing.assert_array_equal(reader.value(fixed), [1.0, 2.0])
