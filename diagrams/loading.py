@@ -7,6 +7,7 @@ Overrides are dotted paths: ``wind.speed=5``, ``sensors.gnss.sensor.kind=rtk``.
 
 import copy
 import difflib
+import functools
 import io
 import math
 import types
@@ -73,7 +74,7 @@ def load_scenario(name: str | Path, overrides: Mapping[str, Any] | Sequence[str]
 def validate(kind: type, tree: Mapping[str, Any], source: str) -> Any:
     """Build a configuration dataclass from plain data, or raise `ScenarioError`."""
     try:
-        return pydantic.TypeAdapter(kind).validate_python(_plain(tree))
+        return pydantic.TypeAdapter(kind).validate_python(_completed(kind, _plain(tree)))
     except pydantic.ValidationError as error:
         raise ScenarioError(_sentence(error, kind, tree, source)) from None
 
@@ -257,6 +258,41 @@ def _describe(value: Any) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return repr(value)
+
+
+def _completed(kind: Any, given: Any) -> Any:
+    """`given` with every map in it filled up from the default of the field that it is for.
+
+    A field's own default may differ from that of its class: a latency given in part keeps the
+    other parts of that sensor's latency. A map of another `kind` starts afresh.
+    """
+    options = _options(kind)
+    if isinstance(given, list):
+        inside = next((typing.get_args(o)[0] for o in options if typing.get_args(o)), None)
+        return [_completed(inside, value) for value in given]
+    owners: list[Any] = [o for o in options if is_dataclass(o)]
+    if len(owners) > 1:
+        owners = [o for o in owners if isinstance(given, dict) and _tag(o) == given.get("kind")]
+    if not isinstance(given, dict) or not owners:
+        return given
+    hints = typing.get_type_hints(owners[0])
+    full = dict(given)
+    for name, default in _map_defaults(owners[0]).items():
+        if isinstance(full.get(name), dict):
+            full[name] = _merge(copy.deepcopy(default), full[name])
+    return {name: _completed(hints.get(name), value) for name, value in full.items()}
+
+
+@functools.cache
+def _map_defaults(owner: Any) -> dict[str, Any]:
+    """The defaults of a dataclass's fields that are dataclasses themselves, as plain maps."""
+    defaults = {}
+    for field in fields(owner):
+        info = owner.__pydantic_fields__[field.name]
+        value = info.get_default(call_default_factory=True)
+        if is_dataclass(value):
+            defaults[field.name] = to_plain(value)
+    return defaults
 
 
 def _walk(kind: Any, location: Sequence[Any]) -> tuple[list[str], Any]:

@@ -132,3 +132,14 @@ def test_overrides_are_not_written_into():
         assert with_overrides(final, {"aircraft": aircraft}).aircraft.altitude_error == 4.0
         changed = with_overrides(final, {"aircraft": aircraft, "aircraft.altitude_error": 0.0})
         assert changed.aircraft.altitude_error == 0.0
+
+
+def test_a_map_given_in_part_keeps_the_rest_of_its_fields_default():
+    path = "sensors.infrared_camera.latency"
+    whole = load_scenario("infrared-and-marker")
+    assert whole.sensors.infrared_camera.latency.processing == 0.02
+    for change in ({f"{path}.transport": 0.03}, {path: {"transport": 0.03}}):
+        by_file = load_scenario("infrared-and-marker", change)
+        assert by_file.sensors.infrared_camera.latency.transport == 0.03
+        assert by_file.sensors.infrared_camera.latency.processing == 0.02
+        assert with_overrides(whole, change) == by_file
