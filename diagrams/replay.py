@@ -71,9 +71,9 @@ class ReplayEkf2(Ekf2):
     An observation is stamped with its time of validity, from which PX4's EKF2_…_DELAY are
     taken off (but for GNSS, whose driver knows its delay).
 
-    | event | period | offset | what happens |
-    |---|---|---|---|
-    | update | every step | | the samples that have arrived since the last one, IMU first |
+    | event | when | does |
+    |---|---|---|
+    | update | every step | takes the samples that have arrived since the last one, IMU first |
 
     Parameters
     ----------

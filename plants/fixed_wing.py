@@ -116,7 +116,7 @@ class FixedWing(LeafSystem):
     Equations: `plants.fixed_wing_dynamics`. It touches the ground where the
     wheels reach the terrain.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | initialize | at the start | the trimmed aircraft at the start of the last `configure` |
     | advance | every 10 ms from 0 | moves by 10 ms under the command at t |

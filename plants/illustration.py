@@ -1,4 +1,4 @@
-"""What the world looks like: a multirotor, its pad and the ground, for Meshcat.
+"""What the world looks like: a multirotor, its pad, LED beacons and the ground, for Meshcat.
 
 Pictures only; no sensor sees these shapes. `draw` puts them into a `Meshcat`
 once and `move` poses them; `add_illustration` registers them with a SceneGraph
@@ -7,6 +7,7 @@ and wires the poses, so that Drake's `MeshcatVisualizer` records them.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import cv2
@@ -33,6 +34,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 
 from plants.pads import MARKER_CELLS, MARKER_DICTIONARY, NestedMarkerConfig, PadConfig
+from plants.svgs_beacons import BEACON_NAMES, COLOURS, SvgsBeaconsConfig
 from plants.vehicles import Vehicle
 from systems.signals.measurement import BODY_STATE, PAD_STATE
 
@@ -49,6 +51,10 @@ _INK = Rgba(0.03, 0.03, 0.03, 1.0)
 _BEACON = Rgba(0.75, 0.08, 0.25, 1.0)
 _RELIEF = 0.001  # m, height of one printed layer over the one below
 _BOARD_THICKNESS = 0.02  # m
+_GLOW = 2.0  # drawn radius of an LED over its own, to be seen from some metres away
+# m, opacity: of the edges between a beacon's LEDs, which show what belongs together; nothing stands
+# there for a vehicle to hit
+_EDGE_RADIUS, _EDGE_OPACITY = 0.008, 0.35
 
 
 @dataclass(frozen=True)
@@ -155,8 +161,8 @@ def marker_pieces(marker: NestedMarkerConfig) -> list[Piece]:
     return pieces
 
 
-def pad_pieces(pad: PadConfig) -> list[Piece]:
-    """The pad in P: a white board with a coloured rim, its marker and its beacon."""
+def pad_pieces(pad: PadConfig, svgs_beacons: SvgsBeaconsConfig | None = None) -> list[Piece]:
+    """The pad in P: a white board with a coloured rim, its marker, beacon and LED beacons."""
     side = max(pad.side, 0.1)
     middle = -0.5 * _BOARD_THICKNESS
     pieces = [
@@ -168,6 +174,26 @@ def pad_pieces(pad: PadConfig) -> list[Piece]:
     if pad.beacon is not None:
         x, y, z = pad.beacon.position
         pieces.append(Piece("beacon", Cylinder(0.006, 0.008), _at(x, y, z + 0.008), _BEACON))
+    if svgs_beacons is not None:
+        pieces += svgs_pieces(svgs_beacons)
+    return pieces
+
+
+def svgs_pieces(beacons: SvgsBeaconsConfig) -> list[Piece]:
+    """The SVGS beacons in P: tetrahedra of LEDs in their colours, and the false lights."""
+    pieces = []
+    for name, beacon in zip(BEACON_NAMES, beacons.beacons(), strict=True):
+        colour, leds = Rgba(*COLOURS[beacon.colour], 1.0), beacon.led_positions_in_pad()
+        edge = Rgba(colour.r(), colour.g(), colour.b(), _EDGE_OPACITY)
+        lamp = Sphere(_GLOW * beacon.lamp_radius)
+        pieces += [Piece(f"{name}_led{i}", lamp, _at(*led), colour) for i, led in enumerate(leds)]
+        pieces += [
+            _rod(f"{name}_edge{i}{j}", leds[i], leds[j], _EDGE_RADIUS, edge)
+            for i, j in combinations(range(len(leds)), 2)
+        ]
+    for i, glint in enumerate(beacons.glints):
+        colour, light = Rgba(*COLOURS[glint.colour], 1.0), Sphere(_GLOW * glint.radius)
+        pieces.append(Piece(f"glint{i}", light, _at(*glint.position), colour))
     return pieces
 
 
@@ -198,11 +224,17 @@ def pad_pose(pad: np.ndarray[Any, Any]) -> RigidTransform:
     return RigidTransform(turn, p)
 
 
-def draw(meshcat: Meshcat, vehicle: Vehicle, pad: PadConfig, path: str = "/plumbline") -> None:
+def draw(
+    meshcat: Meshcat,
+    vehicle: Vehicle,
+    pad: PadConfig,
+    path: str = "/plumbline",
+    svgs_beacons: SvgsBeaconsConfig | None = None,
+) -> None:
     """Draw ground, pad and vehicle into `meshcat` below `path`; pose them with `move`."""
     groups = {
         "ground": ground_pieces(),
-        "pad": pad_pieces(pad),
+        "pad": pad_pieces(pad, svgs_beacons),
         "multirotor": vehicle_pieces(vehicle),
     }
     for group, pieces in groups.items():
@@ -251,14 +283,20 @@ class MultirotorGeometry(LeafSystem):
     It has no state and no events.
     """
 
-    def __init__(self, scene_graph: SceneGraph, vehicle: Vehicle, pad: PadConfig):
+    def __init__(
+        self,
+        scene_graph: SceneGraph,
+        vehicle: Vehicle,
+        pad: PadConfig,
+        svgs_beacons: SvgsBeaconsConfig | None = None,
+    ):
         super().__init__()
         self._pad = pad.state(0.0)
         self.source_id = scene_graph.RegisterSource("plumbline")
         self._frames: dict[str, FrameId] = {}
         for group, pieces in (
             ("multirotor", vehicle_pieces(vehicle)),
-            ("pad", pad_pieces(pad)),
+            ("pad", pad_pieces(pad, svgs_beacons)),
         ):
             frame = scene_graph.RegisterFrame(self.source_id, GeometryFrame(group))
             self._frames[group] = frame
@@ -303,9 +341,10 @@ def add_illustration(
     body: OutputPort,
     pad_port: OutputPort | None = None,
     name: str = "illustration",
+    svgs_beacons: SvgsBeaconsConfig | None = None,
 ) -> MultirotorGeometry:
     """Show the vehicle of port `body` (and the pad of `pad_port`) in `scene_graph`."""
-    system = MultirotorGeometry(scene_graph, vehicle, pad)
+    system = MultirotorGeometry(scene_graph, vehicle, pad, svgs_beacons)
     builder.AddNamedSystem(name, system)
     builder.Connect(body, system.GetInputPort("body"))
     if pad_port is not None:

@@ -1,4 +1,7 @@
-"""A run with its folder: fly, then write `run.json`, `log.parquet`, `log.ulg`, `report.html`."""
+"""A run with its folder: fly, then write `run.json`, `log.parquet`, `log.ulg`, `report.html`.
+
+A scenario's data recorder writes `companion.csv` there on the way.
+"""
 
 import json
 import math
@@ -40,6 +43,8 @@ def fly_and_report(scenario: Any, folder: Path, live: bool = False, report: bool
     if live and shown.live is None:
         raise ScenarioError(f"--live: there is no live view of a {scenario.kind}")
     lab = laboratory(scenario)
+    if shown.record is not None:
+        shown.record(lab.landing, folder)
     simulator = lab.start()
     strip = CameraStrip(lab.landing, shown.frame_period)
     if live and shown.live is not None:

@@ -18,6 +18,7 @@ from bokeh.models.layouts import LayoutDOM
 from bokeh.plotting import figure
 
 from runs.logs import port_samples
+from systems.schedule import SUPERVISOR_PERIOD
 
 # Okabe and Ito's palette: distinguishable with any colour vision.
 BLUE, ORANGE, GREEN, RED = "#0072b2", "#e69f00", "#009e73", "#d55e00"
@@ -79,7 +80,7 @@ class RunPlots:
 
     def ground_plan(self) -> figure:
         """The flight from above: truth, estimate, setpoint, pad and touchdown."""
-        plot = _figure("Ground track", "east (m)", "north (m)", match_aspect=True, height=420)
+        plot = blank_figure("Ground track", "east (m)", "north (m)", match_aspect=True, height=420)
         setpoint = self.port("setpoint")
         if setpoint is not None:
             plot.line(
@@ -113,11 +114,11 @@ class RunPlots:
             HoverTool(renderers=[line], tooltips=[("t", "@t{0.0} s"), ("z", "@z{0.00} m")])
         )
         self._pad(plot)
-        return _finish(plot)
+        return finish_figure(plot)
 
     def final_approach(self) -> figure:
         """The last metres above the pad, from above."""
-        plot = _figure(
+        plot = blank_figure(
             "Last two metres of descent", "east (m)", "north (m)", match_aspect=True, height=420
         )
         low = (self.body["p_WB_z"] < 2.0) & (
@@ -143,7 +144,7 @@ class RunPlots:
                 color=RED,
                 legend_label=f"landed {100 * math.hypot(x, y):.1f} cm off",
             )
-        return _finish(plot)
+        return finish_figure(plot)
 
     def _pad(self, plot: figure) -> None:
         for radius in (0.1, 0.5, 1.0):
@@ -166,17 +167,22 @@ class RunPlots:
     # ----------------------------------------------------------------- in time
 
     def supervisor_state(self) -> figure:
-        """Which state the supervisor was in."""
+        """Which state the supervisor was in, without those that it only passed through."""
         index = self.supervisor["state"].astype(int)
-        used = [self.states[i] for i in dict.fromkeys(index)]
-        plot = self._time_figure(
-            "Supervisor", "", height=90 + 22 * len(used), y_range=list(reversed(used))
-        )
         time = self.supervisor["time"]
         change = np.flatnonzero(np.diff(index, prepend=-1))
         left = time[change]
         right = np.append(time[change[1:]], self.end)
-        names = [self.states[i] for i in index[change]]
+        # It changes its state once a tick, so one that is passed through lasts a tick, or a sample
+        tick = max(SUPERVISOR_PERIOD, float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
+        entered = index[change]
+        stayed = np.isin(entered, entered[right - left > 1.5 * tick])
+        left, right = left[stayed], right[stayed]
+        names = [self.states[i] for i in entered[stayed]]
+        used = list(dict.fromkeys(names))
+        plot = self._time_figure(
+            "Supervisor", "", height=90 + 22 * len(used), y_range=list(reversed(used))
+        )
         colours = [STATE_COLOURS[used.index(name) % len(STATE_COLOURS)] for name in names]
         plot.hbar(y=names, left=left, right=right, height=0.7, color=colours, alpha=0.85)
         return plot
@@ -187,7 +193,7 @@ class RunPlots:
         estimate = self.port("estimate")
         if estimate is not None:
             known = estimate["vertical_valid"] > 0.5
-            _band(
+            uncertainty_band(
                 plot,
                 estimate["time"][known],
                 estimate["p_WB_z"][known],
@@ -230,7 +236,7 @@ class RunPlots:
             truth = -np.interp(time, self.body["time"], self.body[f"p_WB_{axis}"])
             error = target[f"p_BP_W_{axis}"][used] - truth
             sigma = np.sqrt(target[f"position_variance_{axis}"][used])
-            _band(plot, time, np.zeros_like(time), 3.0 * sigma, colour)
+            uncertainty_band(plot, time, np.zeros_like(time), 3.0 * sigma, colour)
             plot.line(time, error, color=colour, line_width=1.5, legend_label=f"{name}, 3 σ")
         if len(time):
             limit = float(np.quantile(np.abs(error), 0.99)) * 3.0 + 0.05
@@ -287,7 +293,7 @@ class RunPlots:
             error = estimate[f"{quantity}_{axis}"][known] - truth
             if axis != "y":  # east and north have nearly the same variance
                 sigma = np.sqrt(estimate[f"{variance}_{axis}"][known])
-                _band(plot, time, np.zeros_like(time), 3.0 * sigma, colour)
+                uncertainty_band(plot, time, np.zeros_like(time), 3.0 * sigma, colour)
             plot.line(time, error, color=colour, line_width=1.5, legend_label=name)
         return self._finish_time(plot)
 
@@ -328,7 +334,9 @@ class RunPlots:
         return self._finish_time(plot)
 
     def _time_figure(self, title: str, unit: str, height: int = HEIGHT, **kwargs) -> figure:
-        return _figure(title, "time (s)", unit, height=height, x_range=self.time_range, **kwargs)
+        return blank_figure(
+            title, "time (s)", unit, height=height, x_range=self.time_range, **kwargs
+        )
 
     def _finish_time(self, plot: figure) -> figure:
         started = self._landing_started()
@@ -342,10 +350,11 @@ class RunPlots:
                     line_width=1,
                 )
             )
-        return _finish(plot)
+        return finish_figure(plot)
 
 
-def _figure(title: str, x_label: str, y_label: str, **kwargs) -> figure:
+def blank_figure(title: str, x_label: str, y_label: str, **kwargs) -> figure:
+    """An empty figure in the laboratory's style; `kwargs` are Bokeh's own."""
     plot = figure(
         title=Title(text=title, text_font="system-ui", text_font_size="11pt", text_color=INK),
         x_axis_label=x_label,
@@ -368,7 +377,8 @@ def _figure(title: str, x_label: str, y_label: str, **kwargs) -> figure:
     return plot
 
 
-def _finish(plot: figure) -> figure:
+def finish_figure(plot: figure) -> figure:
+    """`plot` with its legend, if it has one by now, in the laboratory's style."""
     if plot.legend:
         plot.legend.location = "top_right"
         plot.legend.click_policy = "hide"
@@ -379,10 +389,18 @@ def _finish(plot: figure) -> figure:
     return plot
 
 
-def _band(
+def uncertainty_band(
     plot: figure, time: np.ndarray, centre: np.ndarray, half_width: np.ndarray, colour: str
 ) -> None:
-    """A translucent band, for the estimator's own uncertainty."""
+    """Draw a translucent band, for the estimator's own uncertainty.
+
+    Parameters
+    ----------
+    plot : figure
+    time, centre, half_width : array of shape (n,)
+        The horizontal axis, and the band in the unit of the vertical one.
+    colour : str
+    """
     plot.varea(
         x=time, y1=centre - half_width, y2=centre + half_width, fill_color=colour, fill_alpha=0.12
     )

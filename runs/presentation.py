@@ -1,13 +1,14 @@
 """How each kind of run is shown: its plots, its replay, its logs for other tools."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 from bokeh.models.layouts import LayoutDOM
 
+from diagrams.landing import LandingDiagram
 from runs.plots import RunPlots
 from runs.px4_topics import px4_topics
 from runs.replay_3d import live_view, replay_html
@@ -36,6 +37,8 @@ class Presentation:
         (diagram, scenario) to a monitor for the simulator that shows the flight.
     write_logs : callable, optional
         (folder, log): logs for other tools.
+    record : callable, optional
+        (diagram, folder), before the flight: files that the flight itself writes.
     """
 
     layouts: Callable[[pa.Table, Sequence[str], Any], dict[str, LayoutDOM]]
@@ -45,6 +48,7 @@ class Presentation:
     replay: Callable[[Any, pa.Table], str] | None = None
     live: Callable[[Any, Any], Callable] | None = None
     write_logs: Callable[[Path, pa.Table], None] | None = None
+    record: Callable[[Any, Path], None] | None = None
 
 
 def _multirotor_layouts(
@@ -78,6 +82,13 @@ def _write_px4_log(folder: Path, log: pa.Table) -> None:
     write_ulog(folder / "log.ulg", px4_topics(log), information={"sys_name": "Plumbline"})
 
 
+def _record_on_board(landing: LandingDiagram, folder: Path) -> None:
+    """Have a data recorder that was given no path write into the run's folder."""
+    recorder = landing.recorder
+    if recorder is not None and not recorder.config.path:
+        recorder.configure(replace(recorder.config, path=str(folder / "companion.csv")))
+
+
 PRESENTATIONS: dict[str, Presentation] = {
     "multirotor_landing": Presentation(
         layouts=_multirotor_layouts,
@@ -87,6 +98,7 @@ PRESENTATIONS: dict[str, Presentation] = {
         replay=replay_html,
         live=live_view,
         write_logs=_write_px4_log,
+        record=_record_on_board,
     ),
     "landing_without_gps": Presentation(
         layouts=lambda log, states, scenario: {

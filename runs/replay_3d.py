@@ -33,7 +33,7 @@ def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
     Parameters
     ----------
     scenario : MultirotorLanding
-        Whose vehicle and pad to draw.
+        Whose vehicle, pad and LED beacons (if it has an SVGS camera) to draw.
     log : pa.Table
         Whose ports `body` and `pad` to follow.
     """
@@ -50,7 +50,7 @@ def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
     scene.StopRecording()
     scene.PublishRecording()
     page = scene.StaticHtml()
-    scene.Delete()
+    scene.Delete(_PATH)
     scene.DeleteRecording()
     return page
 
@@ -77,14 +77,16 @@ def live_view(landing: LandingDiagram, scenario: MultirotorLanding) -> Callable:
 def _scene(scenario: MultirotorLanding) -> Meshcat:
     """Meshcat with the vehicle, the pad and the ground, and a camera that sees the flight."""
     scene = meshcat()
-    scene.Delete()
+    scene.Delete(_PATH)
     scene.SetProperty("/Grid", "visible", False)
     scene.SetProperty("/Axes", "visible", False)
     scene.SetProperty("/Background", "top_color", [0.62, 0.74, 0.88])
     scene.SetProperty("/Background", "bottom_color", [0.93, 0.95, 0.97])
     scene.SetProperty("/Lights/AmbientLight/<object>", "intensity", 1.2)
     scene.SetProperty("/Lights/FillLight/<object>", "intensity", 1.0)
-    draw(scene, scenario.vehicle.resolved_vehicle(), scenario.pad, _PATH)
+    phone = scenario.sensors.svgs_camera
+    beacons = None if phone is None else phone.sensor.beacons
+    draw(scene, scenario.vehicle.resolved_vehicle(), scenario.pad, _PATH, beacons)
     scene.SetCameraPose(np.array([-3.2, -5.2, 2.8]), np.array([0.4, 0.0, 1.0]))
     return scene
 

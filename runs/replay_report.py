@@ -13,7 +13,18 @@ from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
 from runs.flight_log import FlightLog
-from runs.plots import BLUE, GREEN, HEIGHT, ORANGE, PURPLE, RED, SKY, _band, _figure, _finish
+from runs.plots import (
+    BLUE,
+    GREEN,
+    HEIGHT,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    blank_figure,
+    finish_figure,
+    uncertainty_band,
+)
 from runs.replay import OUTPUT_COLUMNS, Replay
 from runs.replay_diagnosis import GATES, diagnosis, horizon, source_rows, summaries
 from runs.replay_sweep import Sweep
@@ -26,7 +37,7 @@ _AXIS_COLOURS = (BLUE, ORANGE, GREEN)
 
 def _finished(plot: figure) -> figure:
     """With its legend above, where it hides nothing and all time axes stay aligned."""
-    plot = _finish(plot)
+    plot = finish_figure(plot)
     if plot.legend:
         legend = plot.legend[0]
         plot.center.remove(legend)
@@ -65,7 +76,9 @@ class ReplayPlots:
         return (microseconds - self.start) * 1e-6
 
     def _time_figure(self, title: str, unit: str, height: int = HEIGHT, **kwargs) -> figure:
-        return _figure(title, "time (s)", unit, height=height, x_range=self.time_range, **kwargs)
+        return blank_figure(
+            title, "time (s)", unit, height=height, x_range=self.time_range, **kwargs
+        )
 
     def _line(self, plot: figure, time: np.ndarray, values: np.ndarray, **style) -> None:
         stride = max(1, len(time) // _POINTS)
@@ -165,7 +178,7 @@ class ReplayPlots:
         )
         for factor in (gate, 3.0, 1.0):
             band = (factor * sigma)[::stride].astype("f4")
-            _band(plot, time[::stride].astype("f4"), np.zeros_like(band), band, BLUE)
+            uncertainty_band(plot, time[::stride].astype("f4"), np.zeros_like(band), band, BLUE)
         fused, rejected = rows[:, 12] > 0.5, rows[:, 11] > 0.5
         finite = np.isfinite(rows[:, 7])
         for chosen, colour, label in (
@@ -202,7 +215,7 @@ class ReplayPlots:
 
     def sweep(self, sweep: Sweep) -> figure:
         """The score over the swept parameter."""
-        plot = _figure(f"Innovation test over {sweep.parameter}", sweep.parameter,
+        plot = blank_figure(f"Innovation test over {sweep.parameter}", sweep.parameter,
                        "log-likelihood of an innovation", height=HEIGHT)  # fmt: skip
         points = [point for point in sweep.points if np.isfinite(point.score)]
         plot.line([p.value for p in points], [p.score for p in points], color=BLUE, line_width=1.5)

@@ -25,9 +25,9 @@ from runs.plots import (
     RED,
     SKY,
     STATE_COLOURS,
-    _band,
-    _figure,
-    _finish,
+    blank_figure,
+    finish_figure,
+    uncertainty_band,
 )
 from systems.supervisors.runway_phases import Phase
 
@@ -104,7 +104,7 @@ class RunwayPlots:
 
     def ground_track(self) -> figure:
         """The flight from above (Figs. 9, 42)."""
-        plot = _figure(
+        plot = blank_figure(
             "Ground track", "right of the runway (m)", "along it (m)", match_aspect=True, height=520
         )
         runway = self.scenario.runway
@@ -141,7 +141,7 @@ class RunwayPlots:
         plot.add_tools(
             HoverTool(renderers=[line], tooltips=[("right", "@x{0} m"), ("along", "@y{0} m")])
         )
-        return _finish(plot)
+        return finish_figure(plot)
 
     def profile(self) -> figure:
         """The landing from the side."""
@@ -156,7 +156,7 @@ class RunwayPlots:
         )
         ground = -self.truth["p_n_z"][cut] - self.truth["height"][cut]
         plot.line(self.to_go, ground, color=GREEN, line_width=1.5, legend_label="ground below")
-        return _finish(plot)
+        return finish_figure(plot)
 
     # ------------------------------------------------------------------- in time
 
@@ -164,7 +164,7 @@ class RunwayPlots:
         """Which phase when."""
         names = [self.states[i] for i in dict.fromkeys(self.phase)]
         end = float(self.time[-1])
-        plot = _figure(
+        plot = blank_figure(
             "Phases", "time (s)", "", height=90 + 22 * len(names), x_range=Range1d(0.0, end),
             y_range=list(reversed(names)),
         )  # fmt: skip
@@ -213,7 +213,7 @@ class RunwayPlots:
         for angle, colour in (("pitch", BLUE), ("roll", ORANGE)):
             values = np.degrees(self.truth[angle][self.landing])
             plot.line(self.to_go, values, color=colour, line_width=1.2, legend_label=angle)
-        return _finish(plot)
+        return finish_figure(plot)
 
     def _error_figure(
         self, title: str, unit: str, error: np.ndarray, deviation: np.ndarray
@@ -222,7 +222,7 @@ class RunwayPlots:
         cut = self.landing
         good = np.isfinite(error[cut]) & np.isfinite(deviation[cut])
         x, shown, envelope = self.to_go[good], error[cut][good], 3.0 * deviation[cut][good]
-        _band(plot, x, np.zeros_like(x), envelope, RED)
+        uncertainty_band(plot, x, np.zeros_like(x), envelope, RED)
         for side in (-1.0, 1.0):
             plot.line(x, side * envelope, color=RED, line_width=1, legend_label="3 σ")
         plot.line(x, shown, color=BLUE, line_width=1.5, legend_label="error")
@@ -230,10 +230,10 @@ class RunwayPlots:
             # the envelope of the first seconds would dwarf the rest
             limit = 1.2 * max(np.quantile(np.abs(shown), 0.99), np.quantile(envelope, 0.8), 1e-6)
             plot.y_range = Range1d(-float(limit), float(limit))
-        return _finish(plot)
+        return finish_figure(plot)
 
     def _landing_figure(self, title: str, unit: str) -> figure:
-        plot = _figure(title, "distance to go (m)", unit, height=260, x_range=self.range)
+        plot = blank_figure(title, "distance to go (m)", unit, height=260, x_range=self.range)
         phase = self.phase[self.landing]
         for change in np.flatnonzero(np.diff(phase)) + 1:
             plot.add_layout(

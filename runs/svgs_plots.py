@@ -13,7 +13,18 @@ from bokeh.plotting import figure
 
 from diagrams.scenario import MultirotorLanding
 from plants.svgs_beacons import BEACON_NAMES
-from runs.plots import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, RunPlots, _figure, _finish
+from runs.plots import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    RunPlots,
+    blank_figure,
+    finish_figure,
+)
 from systems.supervisors.svgs_routine import SvgsRoutineConfig
 from systems.vision.svgs_selection import (
     AMBIGUOUS,
@@ -124,7 +135,9 @@ class SvgsPlots(RunPlots):
 
     def landing_zone(self) -> figure:
         """Figure 14: the landing zone, the beacons and where the vehicle stands."""
-        plot = _figure("Landing zone", "forward (m)", "left (m)", match_aspect=True, height=460)
+        plot = blank_figure(
+            "Landing zone", "forward (m)", "left (m)", match_aspect=True, height=460
+        )
         plot.circle(0.0, 0.0, radius=ZONE, fill_alpha=0.0, line_color=INK, legend_label="zone, 1 m")
         c, s = math.cos(self._pad_yaw), math.sin(self._pad_yaw)
         for beacon, name, colour in zip(
@@ -153,11 +166,13 @@ class SvgsPlots(RunPlots):
                 f, left_of, radius=reach, fill_color=SKY, fill_alpha=0.15, line_color=SKY,
                 legend_label="vehicle",
             )  # fmt: skip
-        return _legend_aside(_finish(plot), "right")
+        return _legend_aside(finish_figure(plot), "right")
 
     def trajectory(self) -> figure:
         """Figure 20: the landing in space, seen from above and aside; heights are drawn shorter."""
-        plot = _figure("Trajectory", "", "", height=460, x_range=DataRange1d(range_padding=0.2))
+        plot = blank_figure(
+            "Trajectory", "", "", height=460, x_range=DataRange1d(range_padding=0.2)
+        )
         plot.axis.visible = False
         plot.grid.visible = False
         started = max(self._landing_started(), 0.0)
@@ -203,7 +218,7 @@ class SvgsPlots(RunPlots):
                 color=BEACON_COLOURS[beacon],
                 legend_label=f"SVGS, {name}-range",
             )
-        return _legend_aside(_finish(plot), "right")
+        return _legend_aside(finish_figure(plot), "right")
 
     def _final(self) -> np.ndarray:
         """The samples of the landing below 5 m."""
@@ -326,7 +341,9 @@ class SvgsPlots(RunPlots):
         flying = np.interp(selection["time"], self.body["time"], self.body["p_WB_z"]) > 1.0
         changed = np.flatnonzero((np.diff(selection["changes"], prepend=0.0) > 0.0) & flying)
         if len(changed) == 0:
-            return _finish(_figure("No change of instance in flight", "time (s)", "m", height=220))
+            return finish_figure(
+                blank_figure("No change of instance in flight", "time (s)", "m", height=220)
+            )
         jumps = np.array(
             [self._flu(selection["position_jump_x"][k], selection["position_jump_y"][k])
              for k in changed]
@@ -336,7 +353,7 @@ class SvgsPlots(RunPlots):
         time = float(selection["changed"][changed[worst]])
         before = int(selection["selected"][changed[worst] - 1])
         after = int(selection["selected"][changed[worst]])
-        plot = _figure(
+        plot = blank_figure(
             f"Instance {before} hands over to {after} at {time:.1f} s",
             "time (s)",
             f"{('forward', 'left')[axis]} (m)",
@@ -354,7 +371,7 @@ class SvgsPlots(RunPlots):
             plot.line(samples["time"][near], self._track(samples)[axis][near], color=colour,
                       line_dash=dash, line_width=2, legend_label=label)  # fmt: skip
         plot.add_layout(Span(location=time, dimension="height", line_color=INK, line_dash="dashed"))
-        return _legend_aside(_finish(plot), "right")
+        return _legend_aside(finish_figure(plot), "right")
 
 
 def _legend_aside(plot: figure, place: Literal["right", "above"]) -> figure:

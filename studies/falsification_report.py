@@ -229,7 +229,8 @@ def _history(finding: Finding) -> Section:
     axes.set_ylabel("severity")
     axes.set_xlim(left=0.0)
     axes.set_ylim(0.0, 1.05 * max(1.0, math.sqrt(len(finding.space.disturbances))))
-    axes.legend(fontsize=8, loc="upper right", ncols=4)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, loc="upper right", ncols=4)
     return Section(
         "The search",
         f"{len(finding.cases)} cases in {finding.asked} flights, each a dot at its severity.",

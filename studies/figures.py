@@ -200,7 +200,8 @@ def exceedance(axes: Axes, samples: Sequence[Sample], label: str) -> None:
     axes.set_ylabel("landings farther out")
     axes.set_xlabel(label)
     _logarithmic(axes)
-    axes.legend(fontsize=8, loc="lower left")
+    if drawn:
+        axes.legend(fontsize=8, loc="lower left")
 
 
 def curve(

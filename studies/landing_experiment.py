@@ -36,9 +36,9 @@ class LandingExperiment:
         -------
         dict
             `landed`, `reason`, `landing_error_m`, `landing_x_m`, `landing_y_m`,
-            `landing_time_s` (to the first contact), `time_to_disarm_s` (to the stopped rotors,
-            both from the start of the landing routine), `touchdown_speed_m_s`, `attempts`,
-            `simulated_s`, `cpu_s`.
+            `landing_started_s` (of the landing routine), from there `landing_time_s` (to the first
+            contact) and `time_to_disarm_s` (to the stopped rotors), `touchdown_speed_m_s`,
+            `attempts`, `simulated_s`, `cpu_s`.
         """
         try:
             scenario = with_overrides(self._scenario, {**overrides, "seed": seed})
@@ -57,6 +57,7 @@ class LandingExperiment:
             "landing_error_m": result.landing_error_m,
             "landing_x_m": x,
             "landing_y_m": y,
+            "landing_started_s": float(status.landing_started),
             "landing_time_s": result.landing_time_s,
             "time_to_disarm_s": disarmed - status.landing_started,
             "touchdown_speed_m_s": result.touchdown_speed_m_s,

@@ -26,15 +26,10 @@ class PublishedTrials:
     key: str  # what `Variant.published` names
     table: str  # of the thesis
     title: str
-    initial_height: float  # m
-    windy: bool  # flown in "regular wind gusts"
     error: NDArray[np.float64]  # m, of the camera from the pad's centre (Normal: from take-off)
     x: NDArray[np.float64]  # m, touchdown from there
     y: NDArray[np.float64]  # m
     time: NDArray[np.float64]  # s, of the landing
-    stated_mean_error: float  # m, in Tables 3 to 5
-    stated_max_error: float  # m
-    stated_mean_time: float | None = None  # s
 
 
 @dataclass(frozen=True)
@@ -44,6 +39,7 @@ class Comparison:
     condition: str
     published: str  # key
     table: str
+    title: str
     quantity: str  # "error" or "time"
     ours: int  # values compared
     theirs: int
@@ -90,20 +86,19 @@ INCONSISTENCIES = (
     "Table 6, trial 1: the error is given as 95 cm, its x and y as 94.2 cm.",
 )
 
-# table: title, initial height (m), windy, stated mean and max error (cm) and mean time (s)
-_ROWS: dict[int, tuple[str, float, bool, float, float, float | None]] = {
-    6: ("Normal", 10.0, False, 67.15, 180.00, None),
-    7: ("IRLock, no failure", 10.0, False, 5.79, 13.86, None),
-    8: ("IRLock, random 0.75", 10.0, False, 21.86, 70.00, None),
-    9: ("IRLock, below 3 m", 10.0, False, 47.10, 66.30, None),
-    10: ("Marker, no failure", 6.0, False, 8.51, 11.60, None),
-    11: ("Marker, random 0.50", 6.0, False, 11.05, 16.50, None),
-    12: ("Marker, below 3 m", 6.0, False, 39.32, 62.90, 17.43),
-    13: ("Fused, no failure", 10.0, True, 13.62, 24.60, None),
-    14: ("Fused, IRLock below 3 m, Marker above 3 m", 10.0, True, 14.66, 20.60, None),
-    15: ("Fused, IRLock above 3 m, Marker below 3 m", 6.0, True, 13.74, 20.40, None),
-    16: ("Fused, IRLock random 0.75, Marker random 0.50", 10.0, True, 29.40, 46.10, None),
-    17: ("Cautious, Marker below 3 m at first", 6.0, True, 14.37, 24.10, 41.46),
+_TITLES = {  # by table of the thesis
+    6: "Normal",
+    7: "IRLock, no failure",
+    8: "IRLock, random 0.75",
+    9: "IRLock, below 3 m",
+    10: "Marker, no failure",
+    11: "Marker, random 0.50",
+    12: "Marker, below 3 m",
+    13: "Fused, no failure",
+    14: "Fused, IRLock below 3 m, Marker above 3 m",
+    15: "Fused, IRLock above 3 m, Marker below 3 m",
+    16: "Fused, IRLock random 0.75, Marker random 0.50",
+    17: "Cautious, Marker below 3 m at first",
 }
 
 
@@ -111,7 +106,7 @@ def _read_trials() -> dict[str, PublishedTrials]:
     text = (resources.files("studies") / "infrared_and_marker_trials.csv").read_text("utf-8")
     lines = list(csv.DictReader(text.splitlines()))
     published = {}
-    for table, (title, height, windy, mean, largest, time) in _ROWS.items():
+    for table, title in _TITLES.items():
         trials = [line for line in lines if int(line["table"]) == table]
 
         def column(name: str, trials: list[dict[str, str]] = trials) -> NDArray[np.float64]:
@@ -122,15 +117,10 @@ def _read_trials() -> dict[str, PublishedTrials]:
             key=key,
             table=f"Table {table}",
             title=title,
-            initial_height=height,
-            windy=windy,
             error=column("error_cm") / 100.0,
             x=column("x_cm") / 100.0,
             y=column("y_cm") / 100.0,
             time=column("time_s"),
-            stated_mean_error=mean / 100.0,
-            stated_max_error=largest / 100.0,
-            stated_mean_time=time,
         )
     return published
 
@@ -171,6 +161,7 @@ def compare(
         condition=condition,
         published=trials.key,
         table=trials.table,
+        title=trials.title,
         quantity=quantity,
         ours=len(mine),
         theirs=len(theirs),

@@ -31,6 +31,14 @@ def hashed_uniform(*coordinates: object) -> float:
     return (hashed(*coordinates) + 0.5) / (1 << _DOUBLE_BITS)
 
 
+def _in_order(law: Any) -> Any:
+    """`law`, unless its limits `low` and `high`, where it has both, are in the wrong order."""
+    low, high = law.low, law.high
+    if low is not None and high is not None and low > high:
+        raise ValueError(f"expected low <= high, found {low} and {high}")
+    return law
+
+
 @configuration
 class Uniform:
     """Every value between two limits is equally likely."""
@@ -39,10 +47,7 @@ class Uniform:
     low: Finite
     high: Finite
 
-    @model_validator(mode="after")
-    def _ordered(self) -> "Uniform":
-        _require_order(self.low, self.high)
-        return self
+    _ordered = model_validator(mode="after")(_in_order)
 
     def quantile(self, u: float) -> float:
         """The value below which the fraction `u` in (0, 1) of all draws lie."""
@@ -59,10 +64,10 @@ class Normal:
     low: Finite | None = None
     high: Finite | None = None
 
+    _ordered = model_validator(mode="after")(_in_order)
+
     @model_validator(mode="after")
-    def _ordered(self) -> "Normal":
-        if self.low is not None and self.high is not None:
-            _require_order(self.low, self.high)
+    def _leaves_something(self) -> "Normal":
         below, above = self._tails()
         if not below < above:
             raise ValueError("the limits leave nothing of the normal distribution")
@@ -92,10 +97,7 @@ class LogUniform:
     low: Positive
     high: Positive
 
-    @model_validator(mode="after")
-    def _ordered(self) -> "LogUniform":
-        _require_order(self.low, self.high)
-        return self
+    _ordered = model_validator(mode="after")(_in_order)
 
     def quantile(self, u: float) -> float:
         """The value below which the fraction `u` in (0, 1) of all draws lie."""
@@ -111,10 +113,7 @@ class UniformInteger:
     low: int
     high: int
 
-    @model_validator(mode="after")
-    def _ordered(self) -> "UniformInteger":
-        _require_order(self.low, self.high)
-        return self
+    _ordered = model_validator(mode="after")(_in_order)
 
     def quantile(self, u: float) -> int:
         """The value below which the fraction `u` in (0, 1) of all draws lie."""
@@ -150,8 +149,3 @@ class Choice:
 Distribution = Annotated[
     Uniform | Normal | LogUniform | UniformInteger | Choice, Field(discriminator="kind")
 ]
-
-
-def _require_order(low: float, high: float) -> None:
-    if low > high:
-        raise ValueError(f"expected low <= high, found {low} and {high}")

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 from pydrake.systems.framework import (
     Context,
@@ -26,7 +25,8 @@ _EARLY = 1e-6  # s, by which a look at the clock may be early
 class DataRecorderConfig:
     """Where and how often."""
 
-    path: str = ""  # of the file; empty: nothing is written
+    # Of the file; empty: `companion.csv` in the run's folder, and nothing where a run has none
+    path: str = ""
     rate: Positive = Field(default=25.0, le=1.0 / CLOCK_PERIOD)  # 1/s; SVGS paper, section 2.5.5
 
     def add_to(
@@ -62,7 +62,7 @@ class DataRecorder(LeafSystem):
     | event | when | does |
     |---|---|---|
     | begin | at initialisation | an empty file with the first line |
-    | update | every CLOCK_PERIOD from 0 | a row, if 1 / rate has passed |
+    | update | every 20 ms from 0 | a row, if 1 / rate has passed |
 
     Parameters
     ----------
@@ -120,6 +120,6 @@ class DataRecorder(LeafSystem):
             if value is None:
                 row += size * [""]
             else:
-                row += [repr(float(x)) for x in np.asarray(value.get_value())]
+                row += value.get_value().tolist()
         self._write(row, "a")
         return EventStatus.Succeeded()

@@ -108,7 +108,7 @@ class FixedWingFlightController(LeafSystem):
     Equations: `systems.controllers.fixed_wing_guidance`. Until the estimate is
     initialised the command stays zero.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | control | every 20 ms from 5 ms | guidance and command by the estimate before t |
     """

@@ -140,7 +140,7 @@ class RunwayErrorFilter(LeafSystem):
     kept from phase to phase; when the laser is activated the altitude is reset,
     its covariance increased, or both by halves (4.2).
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | step | every 10 ms from 5 ms | fuses what arrived; propagates with each new position |
     """

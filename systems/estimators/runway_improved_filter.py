@@ -156,7 +156,7 @@ class RunwayImprovedFilter(LeafSystem):
 
     Equations: `systems.estimators.runway_improved_filter_kernel`.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | step | every 10 ms from 5 ms | propagates and fuses what arrived |
     """

@@ -171,7 +171,7 @@ class RunwayRecord(LeafSystem):
     | passages | (n · PASSAGE.size,) | one `PASSAGE` a distance, row by row |
     | end | END | touchdown and standstill |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | note | every 40 ms from 0 | what has happened since; ends the simulation at the time limit |
     """

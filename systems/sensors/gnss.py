@@ -241,11 +241,11 @@ class Gnss(LeafSystem):
     end by drift √2, which is what a landing at the place of take-off sees of a standalone
     receiver. The receiver's latency is the business of a `DelayLine`.
 
-    The event comes every 20 ms, and sample k is taken by the first one at or after k/rate.
+    Sample k is taken by the first event at or after k/rate.
 
-    | event | period | offset | does |
-    |---|---|---|---|
-    | discrete update | 20 ms | 0 | if a sample is due, takes it |
+    | event | when | does |
+    |---|---|---|
+    | update | every 20 ms from 0 | takes a sample, if one is due |
 
     Parameters
     ----------

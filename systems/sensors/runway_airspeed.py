@@ -51,7 +51,7 @@ class RunwayAirspeed(RunwaySensor):
     | state | FIXED_WING_STATE | the aircraft |
     | measurement | AIRSPEED | valid in the air |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 80 ms from 0 | samples every `period`, lets out after `delay` |
     """

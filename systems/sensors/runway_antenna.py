@@ -72,7 +72,7 @@ class RunwayAntenna(RunwaySensor):
 
     α_k = α_{k−τ} + b + n_k (Leonard 2016, Eq. 16), the elevation likewise.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 0 | samples every `period`, lets out after `delay` |
     """

@@ -56,7 +56,7 @@ class RunwayBaroInertial(RunwaySensor):
     H_k^Baro = Z_{k−τ} + b + sf Z_{k−τ} (Leonard 2016, Eq. 13), where Z is meant
     upwards although the superscript says NED.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 20 ms from 0 | samples every `period`, lets out after `delay` |
     """

@@ -124,7 +124,7 @@ class RunwayCamera(RunwaySensor):
     (angles) and shift it (position). The camera's latency cannot be corrected: its
     time of validity is when the picture left the camera, not when it was taken.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 0 | samples every `period` |
 

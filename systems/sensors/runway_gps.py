@@ -80,7 +80,7 @@ class RunwayGps(RunwaySensor):
     | state | FIXED_WING_STATE | the aircraft |
     | measurement | FIX | valid until the loss |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 0 | samples every `period`, lets out after `delay` |
     """

@@ -56,7 +56,7 @@ class RunwayHeading(RunwaySensor):
 
     ψ_k^mag = ψ_{k−τ} − declination + deviation + n_k (Leonard 2016, 2.2).
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 80 ms from 0 | samples every `period`, lets out after `delay` |
     """

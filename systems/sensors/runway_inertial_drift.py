@@ -146,7 +146,7 @@ class RunwayInertialDrift(LeafSystem):
     baro-inertial sensor instead. At the start the unit has drifted along a
     straight flight since its last reset.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | sample | every 10 ms from 0 | attitude, and every second time the rest |
     """

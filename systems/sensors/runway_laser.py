@@ -56,7 +56,7 @@ class RunwayLaser(RunwaySensor):
     H_k^Laser = H_{k−τ}^AGL + b + n_k (Leonard 2016, Eq. 12). It measures along
     the vertical: the sensor takes out the attitude.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 20 ms from 0 | samples every `period`, lets out after `delay` |
     """

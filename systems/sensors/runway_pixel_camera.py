@@ -83,7 +83,7 @@ class RunwayPixelCamera(LeafSystem):
     the geometric camera and tracker. The coarse aircraft rolls at once, by more from
     one picture to the next than the tracker can follow: fly the lagged one with pixels.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 0 | draws, follows, lets out after the latencies |
     """

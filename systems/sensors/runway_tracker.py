@@ -117,7 +117,7 @@ class RunwayTracker(LeafSystem):
     too near, while it is inside the picture. The time of validity stays the one
     that the camera stamped.
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 40 ms from 5 ms | takes the new picture, lets out after `delay` |
     """

@@ -56,7 +56,7 @@ class RunwayWheelEncoder(RunwaySensor):
     | state | FIXED_WING_STATE | the aircraft |
     | measurement | WHEEL_SPEED | valid with weight on wheels |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | update | every 80 ms from 0 | samples every `period`, lets out after `delay` |
     """

@@ -13,7 +13,7 @@ no diagram with the multirotor.
 | phase | offset | who, in order of cause |
 |---|---|---|
 | sense and decide | 0 ms | plant, sensors, phase supervisor, error record |
-| estimate and act | 5 ms | filter, flight controller |
+| estimate and act | 5 ms | tracker, filter, flight controller |
 """
 
 from numba import njit
@@ -22,11 +22,11 @@ from systems.signals.measurement import Layout, measurement_layout, vector
 
 ATTITUDE_PERIOD = 0.01  # s, IMU attitude and filter, 100 Hz (Table 3)
 NAVIGATION_PERIOD = 0.02  # s, IMU position and speed, baro, flight controller, 50 Hz (Table 3)
-PICTURE_PERIOD = 0.04  # s, camera, 25 Hz (Table 3)
+PICTURE_PERIOD = 0.04  # s, camera and tracker, 25 Hz (Table 3)
 LASER_PERIOD = 0.1  # s, 10 Hz (Table 3)
 SLOW_PERIOD = 0.08  # s, compass, air data and wheels: no rate in the thesis
 ANTENNA_PERIOD = 1.0  # s, 1 Hz (Table 21; Table 3 says 2 Hz)
-ACT_OFFSET = 0.005  # s, the phase of filter and flight controller
+ACT_OFFSET = 0.005  # s, the phase of tracker, filter and flight controller
 
 # The aircraft as it is: the truth that sensors sample.
 FIXED_WING_STATE = Layout(

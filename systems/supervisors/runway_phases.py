@@ -115,7 +115,7 @@ class RunwayPhases(LeafSystem):
     | any in the air | Braking | weight on wheels |
     | Braking | Standstill | the wheels stand |
 
-    | event | when | what |
+    | event | when | does |
     |---|---|---|
     | decide | every 40 ms from 0 | at most one transition; ends the simulation at rest |
     """

@@ -57,7 +57,7 @@ class Px4Control(LeafSystem):
 
     | event | when | does |
     |---|---|---|
-    | update | every CLOCK_PERIOD from 0 | send, if 1 / rate has passed |
+    | update | every 20 ms from 0 | send, if 1 / rate has passed |
     """
 
     def __init__(self, config: Px4ControlConfig, seed: int = 0):

@@ -1,5 +1,7 @@
 """The SVGS paper's system as wired: the companion computer, the scenarios, a whole landing."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +11,8 @@ from diagrams.loading import load_scenario
 from diagrams.scenario import settled
 from diagrams.svgs import RECORDED, companion_computer
 from plants.vehicles import dr_spider
-from runs.run import Laboratory
+from runs.flight import fly_and_report
+from runs.run import Laboratory, laboratory
 from systems.data_recorder import DataRecorderConfig
 from systems.estimators.svgs_companion import SvgsCompanionConfig
 from systems.signals.measurement import EXTERNAL_VISION, SETPOINT, SVGS, VEHICLE_ESTIMATE
@@ -55,10 +58,10 @@ def test_companion_computer_has_the_papers_nodes():
 
 @pytest.mark.parametrize("name", FLIGHTS + BASELINE)
 def test_scenarios_start(name):
-    laboratory = Laboratory(load_scenario(name, {"fidelity": "geometric"}))
-    simulator = laboratory.start()
+    lab = Laboratory(load_scenario(name, {"fidelity": "geometric"}))
+    simulator = lab.start()
     simulator.AdvanceTo(1.0 / 16.0)
-    assert laboratory.landing.state(simulator.get_context()) == "wait"
+    assert lab.landing.state(simulator.get_context()) == "wait"
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
@@ -110,6 +113,33 @@ def test_pictures_of_the_phone():
     ((name, picture),) = landing.camera_pictures(context)
     assert name == "svgs camera"
     assert picture.ndim == 3
+
+
+@pytest.mark.parametrize("name", FLIGHTS + BASELINE)
+def test_no_marker_where_no_camera_looks_for_one(name):
+    scenario = load_scenario(name)
+    assert scenario.sensors.marker_camera is None
+    assert scenario.pad.marker is None
+
+
+def test_a_run_folder_has_the_companions_record_and_a_campaign_has_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scenario = load_scenario("svgs-high-altitude", {"fidelity": "geometric", "time_limit": 2.0})
+    folder = tmp_path / "run"
+    folder.mkdir()
+    result = fly_and_report(scenario, folder, report=False)
+    table = pd.read_csv(folder / "companion.csv")
+    assert len(table) == pytest.approx(25 * result.simulated_s, abs=1)
+    assert {column.partition(".")[0] for column in table} == {"time", *RECORDED}
+    # Where the record went is no part of the scenario that run.json holds
+    assert scenario.data_recorder.path == ""
+    flown = json.loads((folder / "run.json").read_text())["configuration"]
+    assert flown["data_recorder"]["path"] == ""
+    # The same diagram, flown once more for its result alone
+    record = (folder / "companion.csv").read_bytes()
+    laboratory(scenario).fly()
+    assert (folder / "companion.csv").read_bytes() == record
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 @pytest.mark.slow

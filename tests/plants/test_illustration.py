@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from pydrake.geometry import (
     Box,
+    Capsule,
     Cylinder,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
     SceneGraph,
+    Sphere,
     StartMeshcat,
 )
 from pydrake.systems.framework import DiagramBuilder
@@ -17,6 +19,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from plants import illustration
 from plants.multirotor import MultirotorConfig
 from plants.pads import NestedMarkerConfig, Pad, PadConfig
+from plants.svgs_beacons import COLOURS, SvgsBeaconsConfig, SvgsGlint
 from plants.vehicles import VEHICLES, vehicle_named
 from systems.frames import quaternion_from_yaw
 from systems.signals.measurement import BODY_STATE
@@ -56,6 +59,38 @@ def test_inner_levels_lie_on_outer_ones():
     heights = {piece.name: piece.pose.translation()[2] for piece in pieces}
     assert heights["level0"] < heights["level0_white0"] < heights["level1"]
     assert heights["level1"] < heights["level1_white0"] < heights["level2"]
+
+
+def test_svgs_beacons_are_tetrahedra_of_leds_in_their_colours():
+    beacons = SvgsBeaconsConfig(glints=[SvgsGlint(position=[1.0, 2.0, 0.3], colour="red")])
+    beacons.medium.yaw = 0.4
+    pieces = illustration.svgs_pieces(beacons)
+    assert len({piece.name for piece in pieces}) == len(pieces)
+    lights = [piece for piece in pieces if isinstance(piece.shape, Sphere)]
+    lamps = beacons.lamps()  # what the camera sees: place, light
+    np.testing.assert_allclose([piece.pose.translation() for piece in lights], lamps[:, :3])
+    drawn = [[piece.colour.r(), piece.colour.g(), piece.colour.b()] for piece in lights]
+    np.testing.assert_allclose(drawn, lamps[:, 3:6])
+    assert drawn[0] == list(COLOURS["yellow"])
+    # The six edges of a beacon, each from one LED to another.
+    leds = beacons.medium.led_positions_in_pad()
+    edges = {piece.name: piece for piece in pieces if isinstance(piece.shape, Capsule)}
+    assert len(edges) == 3 * 6
+    for i in range(4):
+        for j in range(i + 1, 4):
+            edge = edges[f"medium_edge{i}{j}"]
+            assert edge.shape.length() == pytest.approx(np.linalg.norm(leds[j] - leds[i]))
+            half = 0.5 * edge.shape.length() * edge.pose.rotation().col(2)
+            np.testing.assert_allclose(edge.pose.translation() + half, leds[j], atol=1e-12)
+
+
+def test_a_pad_shows_what_it_has():
+    names = {piece.name for piece in illustration.pad_pieces(PadConfig(marker=None, beacon=None))}
+    assert names == {"board", "rim"}
+    pieces = illustration.pad_pieces(PadConfig(marker=None), SvgsBeaconsConfig())
+    names = {piece.name for piece in pieces}
+    assert names >= {"board", "beacon", "short_led0", "medium_led3", "long_led3"}
+    assert not [name for name in names if name.startswith("level")]
 
 
 @pytest.mark.parametrize("name", VEHICLES)

@@ -1,4 +1,4 @@
-"""The 3-D replay takes as long as the flight."""
+"""The 3-D replay takes as long as the flight, and shows the pad as the cameras know it."""
 
 import numpy as np
 import pyarrow as pa
@@ -33,3 +33,18 @@ def test_each_sample_is_shown_at_its_time(monkeypatch, period):
     assert page.startswith("<!DOCTYPE html>")
     # Meshcat shows the frame that a time lies in
     np.testing.assert_array_equal(np.floor(np.array(shown) / period), np.arange(200))
+
+
+@pytest.mark.parametrize(
+    ("name", "marker", "leds"),
+    [
+        ("svgs-high-altitude", False, True),
+        ("infrared-high-altitude", False, False),
+        ("marker-landing", True, False),
+    ],
+)
+def test_the_pad_has_what_the_cameras_look_for(name, marker, leds):
+    scene = replay_3d._scene(load_scenario(name))
+    assert scene.HasPath("/plumbline/pad/board")
+    assert scene.HasPath("/plumbline/pad/level0") == marker
+    assert scene.HasPath("/plumbline/pad/long_led3") == leds

@@ -45,6 +45,22 @@ def test_the_frame_is_that_of_the_vehicle_before_take_off(plots: SvgsPlots):
     np.testing.assert_allclose(plots._flu(*ahead), [[1.0], [0.0]], atol=1e-12)
 
 
+def test_states_passed_through_have_no_row(plots: SvgsPlots):
+    shown = RunPlots(plots.log, plots.states).supervisor_state()
+    (bars,) = shown.renderers
+    data = bars.data_source.data
+    flown = {plots.states[int(i)] for i in plots.supervisor["state"]}
+    left_at_once = {f"fly to waypoint {i}" for i in (1, 2, 3, 4)}  # the mission has no square
+    assert left_at_once < flown
+    assert not left_at_once & set(shown.y_range.factors)
+    assert {"wait", "climb", "hover", "align"} <= set(shown.y_range.factors)
+    assert set(data["y"]) == set(shown.y_range.factors)
+    longest = dict.fromkeys(data["y"], 0.0)
+    for name, left, right in zip(data["y"], data["left"], data["right"], strict=True):
+        longest[name] = max(longest[name], right - left)
+    assert min(longest.values()) > 0.1
+
+
 def test_layout_has_the_papers_figures(plots: SvgsPlots):
     titles = [plot.title.text for plot in plots.layout().select({"type": figure})]
     for title in ("Landing zone", "Trajectory", "Forward", "Left", "Up", "Beacon hand-over"):

@@ -270,3 +270,11 @@ def test_many_points_are_drawn_as_one_image():
             figures.touchdowns(drawn.subplots(), Sample("many", "#123456", x=x, y=y), 5.0, "cm")
             sizes.append(len(figures.to_svg(drawn, "many")))
     assert sizes[1] < 3 * sizes[0]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("landed", [0, 3])
+def test_tails_have_a_legend_if_anything_landed(landed: int):
+    axes = figures.figure(4.0, 3.0).subplots()
+    figures.exceedance(axes, [Sample("a", "#000000", values=np.arange(1.0, landed + 1))], "m")
+    assert (axes.get_legend() is not None) == (landed > 0)

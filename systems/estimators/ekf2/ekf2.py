@@ -146,14 +146,14 @@ class Ekf2(LeafSystem):
     position, `p_WB` is relative to where the filter started or, with external vision,
     to W's origin; a jump of `p_WB` shows in the reset counters.
 
-    | event | when | what happens |
+    | event | when | does |
     |---|---|---|
     | initialize | at the start | the empty filter of the last `configure` |
-    | update | every `period` from 0 | the IMU sample moves the output predictor; a filter step
-    follows when the samples make up EKF2_PREDICT_US |
+    | update | every `period` (10 ms by default) from 0 | moves the output predictor, may step |
 
-    The other messages are looked at on the tick after the one that sensors have their events
-    on, every 40 ms, and every 20 ms if external vision is connected.
+    The output predictor moves with every IMU sample; a filter step follows when the samples
+    make up EKF2_PREDICT_US. The other messages are looked at on the tick after the one that
+    sensors have their events on, every 40 ms, and every 20 ms if external vision is connected.
 
     The discrete state has two groups: the filter's flat array (see `layout`) and `estimate`.
     """

@@ -335,7 +335,8 @@ FRAME_NED, FRAME_FRD, FRAME_BODY = 0, 1, 2
 
 # Yaw estimator (a Gaussian sum of five filters).
 MODELS = 5
-G_QUATERNION, G_GYRO_BIAS, G_STATE, G_COVARIANCE, G_INNOVATION = 0, 4, 7, 10, 19
+# The quaternion comes first, from 0.
+G_GYRO_BIAS, G_STATE, G_COVARIANCE, G_INNOVATION = 4, 7, 10, 19
 G_NIS, G_DETERMINANT, G_WEIGHT = 21, 22, 23
 G_SIZE = 24
 GSF = _reserve(G_SIZE * MODELS)

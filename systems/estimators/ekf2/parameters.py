@@ -277,7 +277,7 @@ def checked(values: Mapping[str, Value], source: str = "parameters") -> dict[str
     return result
 
 
-_INTEGER_TYPES, _REAL_TYPES = range(1, 9), (9, 10)  # MAV_PARAM_TYPE of MAVLink
+_INTEGER_TYPES = range(1, 9)  # MAV_PARAM_TYPE of MAVLink; 9 and 10 are real
 
 
 def read_parameter_file(path: str | Path) -> dict[str, Value]:
