@@ -1,9 +1,10 @@
-"""What the SVGS camera is worth: `python -m benchmarks.svgs_camera`.
+"""What the SVGS camera is worth: `python -m benchmarks.svgs_camera [GLINT_FRAMES]`.
 
 Prints the error of its pose beside the Cramér-Rao bound over height, how often it is right and
 wrong among glints of the beacon's colour, published against robust, and what a frame costs.
 """
 
+import sys
 import time
 from dataclasses import dataclass, field
 from typing import Literal
@@ -19,11 +20,28 @@ from systems.frames import (
     rotation_matrix,
 )
 from systems.schedule import CLOCK_PERIOD
-from systems.sensors.svgs_camera import SvgsCamera, SvgsCameraConfig
+from systems.sensors.svgs_camera import _FRAME_GAIN, SvgsCamera, SvgsCameraConfig
 from systems.signals.measurement import BODY_STATE, SVGS
+from systems.vision.exposure import SMEAR
 from systems.vision.pinhole import pixel_of_tangents
 from systems.vision.planar_pose import quaternion_from_matrix
-from systems.vision.svgs_blobs import centroid_noise
+from systems.vision.svgs_blobs import (
+    BLOOM,
+    BLOOM_SIGMA,
+    FULL_SCALE,
+    MAXIMUM_SPOTS,
+    READ_NOISE,
+    SHOT_NOISE,
+    SPOT_DISC,
+    SPOT_PEAK,
+    SPOT_RED,
+    SPOT_SIGMA,
+    SPOT_SIZE,
+    SPOT_U,
+    SPOT_V,
+    background,
+    project_lamps,
+)
 from systems.vision.svgs_pose import cramer_rao
 
 Fidelity = Literal["pixels", "geometric"]
@@ -87,6 +105,53 @@ def led_pixels(camera: SvgsCamera, exposure: np.ndarray, beacon: int) -> np.ndar
     return np.array([pixel_of_tangents(camera.camera, x / z, y / z) for x, y, z in p_C])
 
 
+def centroid_bound(spot: np.ndarray, smear: np.ndarray, gain: float) -> np.ndarray:
+    """The Cramér-Rao bound of where a spot is: one sigma of u and v, px, shape (2,).
+
+    Each pixel of each colour tells of it as far as its light changes with it, against read noise,
+    shot noise and the rounding to whole grey levels; a saturated pixel tells nothing.
+
+    Parameters
+    ----------
+    spot : array of shape (SPOT_SIZE,)
+        See `systems.vision.svgs_blobs.project_lamps`.
+    smear : array of shape (2,)
+        px, the way of the image during the exposure.
+    gain : float
+        Exposure time as a fraction of the longest.
+    """
+    peak, disc = spot[SPOT_PEAK], spot[SPOT_DISC]
+    reach = int(np.ceil(disc + 4.0 * BLOOM_SIGMA + 0.5 * np.abs(smear).max()))
+    grid = np.arange(-reach, reach + 1.0)
+
+    def light(u: float, v: float) -> np.ndarray:
+        total = np.zeros((grid.size, grid.size))
+        parts = np.linspace(-0.5, 0.5, 9)
+        for part in parts:
+            du = grid[np.newaxis, :] - (u + part * smear[0])
+            dv = grid[:, np.newaxis] - (v + part * smear[1])
+            d = np.maximum(np.hypot(du, dv) - disc, 0.0)
+            total += (1.0 - BLOOM) * np.exp(-0.5 * (d / SPOT_SIGMA) ** 2)
+            total += BLOOM * np.exp(-0.5 * (d / BLOOM_SIGMA) ** 2)
+        return peak / parts.size * total
+
+    u, v = spot[SPOT_U] % 1.0, spot[SPOT_V] % 1.0
+    h = 1e-3  # px
+    slopes = np.stack(
+        [
+            (light(u + h, v) - light(u - h, v)) / (2.0 * h),
+            (light(u, v + h) - light(u, v - h)) / (2.0 * h),
+        ]
+    )
+    information = np.zeros((2, 2))
+    for colour in spot[SPOT_RED : SPOT_RED + 3]:
+        signal = colour * light(u, v)
+        variance = READ_NOISE**2 + SHOT_NOISE * signal + 1.0 / 12.0
+        weight = np.where(background(gain) + signal < FULL_SCALE, colour**2 / variance, 0.0)
+        information += np.einsum("iyx,jyx,yx->ij", slopes, slopes, weight)
+    return np.sqrt(np.diag(np.linalg.inv(information)))
+
+
 def step(camera: SvgsCamera, context: Context, body: np.ndarray) -> float:
     """One frame; returns its cost, s of CPU."""
     camera.GetInputPort("body").FixValue(context, body)
@@ -129,12 +194,16 @@ def fly(config: SvgsCameraConfig, height: float, frames: int, seed: int = 1) -> 
         true = R_WC.T @ (placement[:3] - exposure[4:7])
         R_CT = R_WC.T @ rotation_matrix(quaternion_from_yaw(placement[3]))
         result.errors.append(measurement[_P] - true)
-        # At this height the LEDs are this bright, and their centroids that good.
-        reach = config.beacons.beacons()[beacon]
-        peak = 60.0 * (reach.margin * reach.operating_range / np.linalg.norm(true)) ** 2
-        noise = centroid_noise(peak) / config.focal_length
+        gain = context.get_discrete_state(2).value()[_FRAME_GAIN]
+        spots = np.empty((MAXIMUM_SPOTS, SPOT_SIZE))
+        count = project_lamps(exposure, camera._lamps, gain, camera.camera, spots)
+        pixels = led_pixels(camera, exposure, beacon)
+        apart = np.linalg.norm(spots[np.newaxis, :count, :2] - pixels[:, np.newaxis], axis=2)
+        of_led = spots[np.argmin(apart, axis=1)]
+        noise = np.array([centroid_bound(spot, exposure[SMEAR], gain) for spot in of_led])
         pose = np.concatenate([true, quaternion_from_matrix(R_CT)])
-        bound = cramer_rao(reach.led_positions(), pose, noise)
+        leds = config.beacons.beacons()[beacon].led_positions()
+        bound = cramer_rao(leds, pose, noise.ravel() / config.focal_length)
         result.bounds.append(np.sqrt(np.diag(bound)[:3]))
     return result
 
@@ -181,14 +250,14 @@ def frame_cost(frames: int = FRAMES) -> float:
     return float(np.median(flown.costs))
 
 
-def main() -> None:
+def main(glint_frames: int = GLINT_FRAMES) -> None:
     """Print the tables."""
     print("SVGS camera, pixels: error of the pose beside the Cramér-Rao bound")
     print("\n".join(accuracy_table()))
     print(f"\nSVGS camera at {GLINT_HEIGHT:.0f} m among glints of the beacon's colour")
-    print("\n".join(glint_table()))
+    print("\n".join(glint_table(frames=glint_frames)))
     print(f"\nA frame in pixels, 4 LEDs in view: {1e3 * frame_cost():.2f} ms of CPU, median")
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))

@@ -286,7 +286,6 @@ def falsify(
     if list_:
         _list_disturbances()
         return
-    from studies.falsification import DEFAULT_DISTURBANCES
     from studies.falsification import falsify as search
     from studies.study import StudyError
 
@@ -295,7 +294,7 @@ def falsify(
         finding = search(
             scenario,
             folder,
-            _names(vary, DEFAULT_DISTURBANCES),
+            _disturbances(vary),
             budget,
             overrides=_flight_overrides(scenario, overrides, fidelity),
             limits=_limits(limits),
@@ -344,7 +343,6 @@ def sensitivity(
     if list_:
         _list_disturbances()
         return
-    from studies.falsification import DEFAULT_DISTURBANCES
     from studies.sensitivity import analyse
     from studies.study import StudyError
 
@@ -353,7 +351,7 @@ def sensitivity(
         analysis = analyse(
             scenario,
             folder,
-            _names(vary, DEFAULT_DISTURBANCES),
+            _disturbances(vary),
             runs,
             method,
             overrides=_flight_overrides(scenario, overrides, fidelity),
@@ -371,10 +369,12 @@ def sensitivity(
     click.echo(f"Report: {folder / 'report.html'}")
 
 
-def _names(text: str | None, default: tuple[str, ...]) -> list[str]:
-    """The names of a list with commas."""
+def _disturbances(text: str | None) -> list[str]:
+    """The names of a list with commas, or the default's."""
+    from studies.falsification import DEFAULT_DISTURBANCES
+
     if text is None:
-        return list(default)
+        return list(DEFAULT_DISTURBANCES)
     return [name.strip() for name in text.split(",") if name.strip()]
 
 

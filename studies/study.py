@@ -209,9 +209,9 @@ class RunSpec:
 class Study:
     """Many runs of one scenario.
 
-    A study with axes is not changed once it is made: its cells are listed once.
-    The study's own overrides hold for every run; those of its variant come on
-    top, then those of its axes, and so do distributions. What a grid varies is set by
+    It is not changed once it is made (`dataclasses.replace` makes another): its cells are listed
+    and its hash is taken once. The study's own overrides hold for every run; those of its variant
+    come on top, then those of its axes, and so do distributions. What a grid varies is set by
     nothing else, and no path has both a value and a distribution.
     """
 
@@ -272,21 +272,15 @@ class Study:
     @property
     def conditions(self) -> list[Condition]:
         """What is flown, in the order of the file, the last grid fastest."""
-        return self._plan().conditions
+        return self._plan.conditions
 
     @property
     def cells(self) -> list[Cell]:
         """Variants times levels times grid points, each with the condition that it shows."""
-        return self._plan().cells
-
-    def _plan(self) -> "_Plan":
-        return self._lasting_plan if self.axes else self._new_plan()
+        return self._plan.cells
 
     @cached_property
-    def _lasting_plan(self) -> "_Plan":
-        return self._new_plan()  # of a study with axes, which has hundreds of cells
-
-    def _new_plan(self) -> "_Plan":
+    def _plan(self) -> "_Plan":
         cells, flown = [], dict[str, Condition]()
         for name, variant in (self.variants or {"default": Variant(label=self.scenario)}).items():
             for steps in itertools.product(*(axis.steps for axis in self.axes.values())):
@@ -394,21 +388,14 @@ class Study:
             definition, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False
         )
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """The hash of `canonical`, 32 hexadecimal digits."""
-        return self._lasting_digest if self.axes else self._new_digest()
-
-    @cached_property
-    def _lasting_digest(self) -> str:
-        return self._new_digest()
-
-    def _new_digest(self) -> str:
         return hashlib.blake2b(self.canonical.encode(), digest_size=16).hexdigest()
 
     def run_spec(self, run: int) -> RunSpec:
         """What run number `run` flies."""
-        plan = self._plan()
+        plan = self._plan
         turn, place = divmod(run, len(plan.block))
         offset, condition = plan.block[place]
         pair = turn * plan.period + offset

@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
 from systems.configuration import NonNegative, Seconds, configuration, require_same_structure
 from systems.estimators import ekf2_selection as decision
 from systems.estimators.ekf2.messages import INNOVATIONS, STATUS
+from systems.frames import yaw_of
 from systems.schedule import SUPERVISOR_PERIOD
 from systems.signals.measurement import INERTIAL, VEHICLE_ESTIMATE, Layout, vector
 
@@ -160,10 +161,6 @@ class Ekf2Selector(LeafSystem):
         for i in range(n):
             for name, size in zip(_PORTS, sizes, strict=True):
                 self.DeclareVectorInputPort(f"{name}_{i}", size)
-        self._innovations = np.empty((n, INNOVATIONS.size))
-        self._status = np.empty((n, STATUS.size))
-        self._imus = np.empty((n, INERTIAL.size))
-        self._aligned = np.empty(n, dtype=bool)
         initial = np.concatenate([np.zeros(_MEMORY), decision.initial_memory(n)])
         initial[_H_THEN] = initial[_V_THEN] = -1.0
         self.DeclareDiscreteState(BasicVector(initial))
@@ -190,7 +187,12 @@ class Ekf2Selector(LeafSystem):
         self.config = config
 
     def _input(self, context: Context, name: str, instance: int) -> np.ndarray:
-        return self.get_input_port(len(_PORTS) * instance + _PORTS.index(name)).Eval(context)
+        port = self.get_input_port(len(_PORTS) * instance + _PORTS.index(name))
+        return port.Eval(context) if port.HasValue(context) else np.full(port.size(), math.nan)
+
+    def _inputs(self, context: Context, name: str) -> np.ndarray:
+        """Those of all instances, a row each; nan where nothing is connected."""
+        return np.stack([self._input(context, name, i) for i in range(self.config.instances)])
 
     def _calc_estimate(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state(0).value()
@@ -236,39 +238,29 @@ class Ekf2Selector(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         state = discrete_state.get_mutable_value(0)
-        for i in range(self.config.instances):
-            self._innovations[i] = self._input(context, "innovations", i)
-            self._status[i] = self._input(context, "status", i)
-            self._aligned[i] = self._input(context, "estimate", i)[_ATTITUDE_VALID] > 0.0
-            imu = self.EvalVectorInput(context, len(_PORTS) * i + _PORTS.index("imu"))
-            self._imus[i] = math.nan if imu is None else imu.get_value()
+        estimates = self._inputs(context, "estimate")
         before = int(state[_MEMORY + decision.SELECTED])
         old = self._selected_estimate(context, state)
         after = decision.choose(
             state[_MEMORY:],
             context.get_time(),
             SELECTOR_PERIOD,
-            self._innovations,
-            self._status,
-            self._aligned,
-            self._imus,
+            self._inputs(context, "innovations"),
+            self._inputs(context, "status"),
+            estimates[:, _ATTITUDE_VALID] > 0.0,
+            self._inputs(context, "imu"),
             self._limits(),
         )
         if after != before:
-            self._hand_over(state, old, self._input(context, "estimate", after))
+            self._hand_over(state, old, estimates[after])
         return EventStatus.Succeeded()
 
     def _hand_over(self, state: np.ndarray, old: np.ndarray, new: np.ndarray) -> None:
         """Remember what jumps, and go on counting where the old instance's counters stand."""
         state[_JUMP : _JUMP + 3] = new[_P] - old[_P]
         state[_JUMP + 3 : _JUMP + 6] = new[_V] - old[_V]
-        state[_JUMP + 6] = math.remainder(_yaw(new[_Q]) - _yaw(old[_Q]), math.tau)
+        state[_JUMP + 6] = math.remainder(yaw_of(new[_Q]) - yaw_of(old[_Q]), math.tau)
         state[_H_ADD] = old[_H_COUNTER] + 1.0 - new[_H_COUNTER]
         state[_V_ADD] = old[_V_COUNTER] + 1.0 - new[_V_COUNTER]
         state[_H_THEN], state[_V_THEN] = new[_H_COUNTER], new[_V_COUNTER]
         state[_CHANGES] += 1.0
-
-
-def _yaw(q: np.ndarray) -> float:
-    w, x, y, z = q
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -27,7 +27,7 @@ _PAD_AT_ORIGIN = PAD_STATE.zeros()
 class PadCamera(LeafSystem):
     """A camera under the vehicle, with ports `body`, `pad` (optional), `measurement` and `image`.
 
-    It looks at its clock every CLOCK_PERIOD. A subclass documents its ports and defines
+    It looks at its clock on every tick. A subclass documents its ports and defines
     `configure`, which sets `config`, `camera` and `X_BC`; `_update`, which takes a frame with
     `_expose` if one is due; and `_image`. The image is not kept: it is rendered again when
     somebody asks, from the exposure and the frame's number.

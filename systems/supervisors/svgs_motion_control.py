@@ -115,6 +115,7 @@ class SvgsMotionControl(LeafSystem):
     | relocate xy, xyz | 4 | trusted position at this height, then its height; 2 s, and reached |
     | offset | 5 | two requests 2.5 s apart |
     | land | 6 | after 2 s, 5 m below |
+    | return | | over the point of the stage, at this height; 2 s, and reached |
 
     Other than in the paper the scan, alignment and offset keep the height they began with (the
     present one would drift in gusts), an offset goes to the point that the commander names instead
@@ -153,6 +154,7 @@ class SvgsMotionControl(LeafSystem):
             routine.RELOCATE_XYZ: self.relocate_xyz,
             routine.OFFSET: self.offset,
             routine.LAND: self.land,
+            routine.RETURN: self.return_to_pad,
         }
 
     def configure(self, config: SvgsRoutineConfig, seed: int = 0) -> None:
@@ -258,6 +260,11 @@ class SvgsMotionControl(LeafSystem):
         """Algorithm 4, then to the trusted position."""
         trusted = motion.command
         self._relocate(motion, trusted.trusted_x, trusted.trusted_y, trusted.trusted_z)
+
+    def return_to_pad(self, motion: Motion) -> None:
+        """Over the aim, at the height it began with."""
+        aim = motion.command
+        self._relocate(motion, aim.aim_x, aim.aim_y, motion.memory.level)
 
     def offset(self, motion: Motion) -> None:
         """Algorithm 5: two requests."""

@@ -8,8 +8,8 @@ are in `svgs_motion_control`; here stands the table of the node `routine_command
 Where the paper leaves it open:
 
 * A beacon that is not seen again after both relocations is waited for, then scanned for with
-  growing squares. When the last square is done the vehicle lands without sight, over the place
-  of the pad as it was last known, or where it is if the pad was never seen.
+  growing squares. When the last square is done the vehicle flies back over the pad as it was last
+  known and lands without sight; it lands where it is if the pad was never seen.
 * After `maximum_relocations` the next loss of sight ends in the same way.
 * Below `final_height` nothing is relocated any more (the paper's U_min): the landing goes on.
 * The vehicle counts as aligned within `align_radius` + `align_slope` · height of the point it
@@ -40,7 +40,7 @@ from systems.supervisors.state_machine import (
 )
 
 # The manoeuvres of the node motion_control_drspider; NONE leaves the setpoint to the mission.
-NONE, HOLD, SCAN, ALIGN, DESCEND, RELOCATE_XY, RELOCATE_XYZ, OFFSET, LAND = range(9)
+NONE, HOLD, SCAN, ALIGN, DESCEND, RELOCATE_XY, RELOCATE_XYZ, OFFSET, LAND, RETURN = range(10)
 
 # What the commander tells motion control.
 COMMAND = Layout(
@@ -99,6 +99,7 @@ class SvgsRoutine:
             State("relocate_xy", entry=("begin_relocation_xy",), stay=("look",)),
             State("relocate_xyz", entry=("begin_relocation_xyz",), stay=("look",)),
             State("wait_for_sight", entry=("begin_hold",), stay=("look",)),
+            State("return_to_pad", entry=("begin_return",), stay=("look",)),
             State("offset_to_short", entry=("begin_offset_to_short",), stay=("look",)),
             State("final_offset", entry=("begin_final_offset",), stay=("look",)),
             State("land", entry=("begin_landing_below_ground",), stay=("look", "feel_ground")),
@@ -112,10 +113,14 @@ class SvgsRoutine:
             Transition("hover", "align", "hovered_in_sight"),
             Transition("hover", "scan", "hovered_out_of_sight"),
             *transitions_from(
-                ("scan", "relocate_xy", "relocate_xyz", "wait_for_sight"), "align", "in_sight"
+                ("scan", "relocate_xy", "relocate_xyz", "wait_for_sight", "return_to_pad"),
+                "align",
+                "in_sight",
             ),
             Transition("scan", "scan", "scanned_and_may_scan"),
+            Transition("scan", "return_to_pad", "scanned_beside_known_pad"),
             Transition("scan", "land_without_sight", "scanned"),
+            Transition("return_to_pad", "land_without_sight", "manoeuvre_done"),
             *transitions_from(("align", "descend"), "land_without_sight", "lost_too_often"),
             *transitions_from(("align", "descend"), "relocate_xy", "lost_above_minimum"),
             Transition("align", "land", "lost_below_minimum"),
@@ -177,6 +182,10 @@ class SvgsRoutine:
     def scanned(self, s: S) -> bool:
         """The square is scanned, and was the last one."""
         return self.manoeuvre_done(s)
+
+    def scanned_beside_known_pad(self, s: S) -> bool:
+        """The last square is scanned, and the pad has been seen before."""
+        return self.manoeuvre_done(s) and s.memory.aim_known > 0.0
 
     def scanned_and_may_scan(self, s: S) -> bool:
         """The square is scanned; the next one is larger."""
@@ -268,6 +277,10 @@ class SvgsRoutine:
     def begin_relocation_xyz(self, s: S) -> None:
         """Algorithm 4, completely."""
         self._begin(s, RELOCATE_XYZ)
+
+    def begin_return(self, s: S) -> None:
+        """Back over the point of the present stage, at this height."""
+        self._begin(s, RETURN)
 
     def begin_offset_to_short(self, s: S) -> None:
         """Algorithm 5, over to the short-range beacon."""

@@ -42,7 +42,7 @@ _SMALLEST_DEPTH = 0.01  # m; nearer than the lens can be there is nothing to see
 
 
 def is_due(time: float, frame_rate: float) -> bool:
-    """Whether a camera that looks at its clock every CLOCK_PERIOD takes a frame at `time` (s).
+    """Whether a camera that looks at its clock on every tick takes a frame at `time` (s).
 
     It does when a multiple of 1 / frame_rate has passed since it last looked,
     so a rate that does not fit the grid is kept on average. The first is at 0.

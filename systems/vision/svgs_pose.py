@@ -223,7 +223,7 @@ def solve_pose(leds, angles, pose, covariance):
     return math.sqrt(cost / ANGLES)
 
 
-def cramer_rao(leds: np.ndarray, pose: np.ndarray, angle_noise: float) -> np.ndarray:
+def cramer_rao(leds: np.ndarray, pose: np.ndarray, angle_noise: float | np.ndarray) -> np.ndarray:
     """The Cramér-Rao bound of a pose, shape (6, 6): p_CT (m²), turn about C's axes (rad²).
 
     Parameters
@@ -232,8 +232,8 @@ def cramer_rao(leds: np.ndarray, pose: np.ndarray, angle_noise: float) -> np.nda
         In T, m.
     pose : array of shape (7,)
         The true one.
-    angle_noise : float
-        One sigma of each angle, rad.
+    angle_noise : float or array of shape (8,)
+        One sigma of the angles, rad: of all, or Az and El of each LED.
 
     Raises
     ------
@@ -243,7 +243,8 @@ def cramer_rao(leds: np.ndarray, pose: np.ndarray, angle_noise: float) -> np.nda
     angles, jacobian = np.empty(ANGLES), np.empty((ANGLES, 6))
     if not predict(leds, pose, angles, jacobian):
         raise ValueError("an LED is behind the camera")
-    return angle_noise**2 * np.linalg.inv(jacobian.T @ jacobian)
+    whitened = jacobian / np.broadcast_to(angle_noise, ANGLES)[:, np.newaxis]
+    return np.linalg.inv(whitened.T @ whitened)
 
 
 @njit(cache=True)

@@ -77,6 +77,7 @@ def test_overrides_are_the_studys_the_variants_and_what_varies(study: Study):
 
 def test_a_variants_override_wins_over_the_studys(study: Study):
     study.variants["ours"].overrides["cameras.fidelity"] = "pixels"
+    study = dataclasses.replace(study)  # a study plans once
     assert study.run_spec(0).overrides["cameras.fidelity"] == "geometric"
     assert study.run_spec(6).overrides["cameras.fidelity"] == "pixels"
 

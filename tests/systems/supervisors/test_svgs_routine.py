@@ -71,6 +71,9 @@ FLIGHTS = {
     "lost for good": lambda: fly(
         8.0, plant={"visible": between(0.0, 12.0), "lost_time": 0.5}, short_height=5.0, **SHORT
     ),
+    "lost, seen on the way back from the scan": lambda: fly(
+        8.0, plant={"visible": outside(12.0, 31.0), "lost_time": 0.5}, short_height=5.0, **SHORT
+    ),
     "lost twice": lambda: fly(
         8.0,
         plant={"visible": lambda t, z: t < 12.0 or 15.5 <= t < 23.0, "lost_time": 0.5},
@@ -160,8 +163,13 @@ def test_never_seen_scans_growing_squares_and_lands_where_it_is():
 
 def test_lost_for_good_lands_at_the_last_known_place():
     flown = flight("lost for good")
-    for state in ("relocate_xy", "relocate_xyz", "wait_for_sight", "scan", "land_without_sight"):
-        assert state in flown.states
+    search = ["relocate_xy", "relocate_xyz", "wait_for_sight", "scan"]
+    assert [state for state in flown.states if state in search][:4] == search
+    assert flown.states[-3:] == ["return_to_pad", "land_without_sight", "landed"]
+    down = np.searchsorted(flown.times, flown.time_of("land_without_sight"))
+    back = np.array([flown.estimates.p_WB_x[down], flown.estimates.p_WB_y[down]])
+    point = PAD + np.array(SvgsRoutineConfig().approach_point)
+    assert np.hypot(*(back - point)) < 0.5  # back there before it sinks
     assert np.hypot(*(flown.position[:2] - PAD)) < 0.05
 
 
