@@ -8,8 +8,8 @@ from pydantic import Field
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from diagrams.recording import Recording
+from diagrams.runway_geometry import require_landing, same_but_for_seed
 from plants.fixed_wing import FixedWing, FixedWingConfig
-from plants.fixed_wing_dynamics import equilibrium_pitch
 from plants.recorded_flight import RecordedFlight, RecordedFlightConfig
 from plants.terrain import FlatTerrain, Terrain
 from systems.configuration import (
@@ -19,17 +19,13 @@ from systems.configuration import (
     require_same_structure,
 )
 from systems.controllers.fixed_wing_flight_controller import FixedWingFlightControllerConfig
-from systems.controllers.fixed_wing_guidance import RouteConfig, landing_altitude
+from systems.controllers.fixed_wing_guidance import RouteConfig
 from systems.controllers.fixed_wing_reference_flight import reference_flight
 from systems.estimators.runway_error_filter import FILTER_INPUTS, RunwayErrorFilterConfig
 from systems.estimators.runway_improved_filter import RunwayImprovedFilterConfig
 from systems.estimators.runway_record import END, RunwayRecordConfig
 from systems.runway_frames import (
     RunwayConfig,
-    bearing_and_elevation,
-    direction_in_camera,
-    ned_from_runway,
-    pixel_from_angles,
 )
 from systems.sensors.runway_airspeed import RunwayAirspeedConfig
 from systems.sensors.runway_antenna import RunwayAntennaConfig
@@ -128,12 +124,11 @@ class LandingWithoutGpsDiagram:
     Raises
     ------
     ValueError
-        For a terrain or a flight that cannot be read, and for a camera that never sees the
-        touch-down point.
+        For a terrain or a flight that cannot be read, and for a landing that is geometrically
+        impossible, see `diagrams.runway_geometry`.
     """
 
     def __init__(self, scenario: LandingWithoutGpsScenario):
-        require_sight(scenario)
         self._scenario = scenario
         builder = DiagramBuilder()
         seed, runway, terrain = scenario.seed, scenario.runway, scenario.terrain
@@ -149,6 +144,8 @@ class LandingWithoutGpsDiagram:
             aircraft = scenario.aircraft.add_to(builder, "aircraft", seed, runway, terrain)
             recorded = ()
             seen = "state"
+        self._checked: LandingWithoutGpsScenario | None = None
+        self._require_landing(scenario, aircraft)
         self._recorded = recorded
         self.systems: dict[str, Any] = {"aircraft": aircraft}
         simulated = {s: sensor for s, sensor in _MEASUREMENTS.items() if s not in recorded}
@@ -228,7 +225,6 @@ class LandingWithoutGpsDiagram:
         ValueError
             As the constructor does.
         """
-        require_sight(scenario)
         for name in ("aircraft", "filter", "camera"):
             require_same_structure(getattr(self._scenario, name), getattr(scenario, name), "kind")
         aircraft, seed, runway = self.systems["aircraft"], scenario.seed, scenario.runway
@@ -242,6 +238,7 @@ class LandingWithoutGpsDiagram:
                 )
         else:
             aircraft.configure(scenario.aircraft, seed, *site)
+        self._require_landing(scenario, aircraft)
         for name, system in self.systems.items():
             if isinstance(scenario.camera, RunwayPixelCameraConfig) and name == "camera":
                 system.configure(scenario.camera, seed, runway, scenario.tracker)
@@ -250,6 +247,16 @@ class LandingWithoutGpsDiagram:
         self.systems["phases"].configure(scenario.phases, seed)
         self.systems["record"].configure(scenario.record, seed, runway, scenario.time_limit)
         self._scenario = scenario
+
+    def _require_landing(
+        self, scenario: LandingWithoutGpsScenario, aircraft: FixedWing | RecordedFlight
+    ) -> None:
+        """Check what has not been checked yet; runs of a campaign differ in the seed alone."""
+        if self._checked is None or not same_but_for_seed(scenario, self._checked):
+            recorded = isinstance(aircraft, RecordedFlight)
+            track = aircraft.model[0][:, 1:4] if recorded else None
+            require_landing(scenario, aircraft.model[-1], track)
+            self._checked = scenario
 
     def _flight(self, scenario: LandingWithoutGpsScenario) -> pd.DataFrame | None:
         """The reference flight, where the scenario replays it; None where it names a file."""
@@ -308,55 +315,6 @@ class LandingWithoutGpsDiagram:
         tracked = PICTURE(self.evaluate("picture", context))
         point = (tracked.u, tracked.v) if tracked.valid > 0.0 else None
         return [("camera", draw_tracked_point(image, point, f"{distance:.0f} m to go"))]
-
-
-def require_sight(scenario: LandingWithoutGpsScenario) -> None:
-    """Be sure that the camera sees the touch-down point somewhere on the landing trajectory.
-
-    Raises
-    ------
-    ValueError
-        Says where the point would lie in the picture.
-    """
-    camera, runway, tracker = scenario.camera, scenario.runway, scenario.tracker
-    controller = scenario.flight_controller
-    profile = controller.route.profile.vector(controller.speed, controller.gear)
-    aircraft = scenario.aircraft
-    if isinstance(aircraft, RecordedFlightConfig):
-        aircraft = FixedWingConfig()  # its recording may be of any; the trim is about the same
-    for axis in ("horizontal", "vertical"):
-        wide = getattr(camera, f"{axis}_field_of_view")
-        if wide >= 180.0:
-            raise ValueError(
-                f"camera.{axis}_field_of_view: expected less than 180 deg, found {wide:g}"
-            )
-    optics = camera.optics()
-    far, near = max(tracker.clicks), max(tracker.loss_distance, 1.0)
-    if far <= near:
-        raise ValueError(
-            f"tracker.clicks: expected a click farther than tracker.loss_distance ({near:g} m), "
-            "or the tracker never has the touch-down point"
-        )
-    for distance in np.linspace(far, near, 40):
-        altitude, slope = landing_altitude(distance, profile)
-        pitch = equilibrium_pitch(
-            aircraft.speed, slope * aircraft.speed, aircraft.pitch_a, aircraft.pitch_b
-        )
-        heading = runway.heading_radians
-        p_n = ned_from_runway(np.array([0.0, -distance, -altitude]), heading)
-        p_c = direction_in_camera(
-            p_n, heading, pitch, 0.0, np.array(camera.position), camera.mounting_radians()
-        )
-        bearing, elevation = bearing_and_elevation(p_c)
-        u, v = pixel_from_angles(bearing, elevation, optics)
-        if p_c[0] > 0.0 and 0.0 <= u < camera.columns and 0.0 <= v < camera.rows:
-            return
-    where = f"at ({u:.0f}, {v:.0f}) px" if p_c[0] > 0.0 else "behind it"
-    raise ValueError(
-        "camera.mounting: expected a camera that sees the touch-down point on the landing "
-        f"trajectory, but there the point lies {where}, and the picture has "
-        f"{camera.columns:g} x {camera.rows:g} px"
-    )
 
 
 # what each measurement is called on its way, and the sensor it comes from

@@ -19,6 +19,7 @@ A sensor whose columns are there is replayed (an empty cell is no sample), the
 others are simulated from the recorded flight.
 """
 
+import difflib
 import math
 from pathlib import Path
 from typing import Literal
@@ -69,6 +70,31 @@ RECORDED_SENSORS: dict[str, tuple[tuple[str, ...], Layout]] = {
 }
 
 
+_COLUMNS = (*FLIGHT_COLUMNS, *(name for names, _ in RECORDED_SENSORS.values() for name in names))
+_MISSPELT = 0.85  # how much alike (difflib) a column is to one of ours that it was meant to be
+
+
+def _require_columns(path: Path, found: list[str]) -> None:
+    """All columns of the flight, all or none of each sensor, and no misspelt one."""
+    for column in found:
+        meant = difflib.get_close_matches(column.lower(), _COLUMNS, n=1, cutoff=_MISSPELT)
+        if column not in _COLUMNS and meant and meant[0] not in found:
+            raise ValueError(
+                f"{path}: unknown column {column!r} in a recorded flight; the nearest is {meant[0]}"
+            )
+    for column in FLIGHT_COLUMNS:
+        if column not in found:
+            raise ValueError(
+                f"{path}: expected the column {column} in a recorded flight, found "
+                f"{', '.join(found)}"
+            )
+    for columns, _ in RECORDED_SENSORS.values():
+        present = [column for column in columns if column in found]
+        missing = [column for column in columns if column not in found]
+        if present and missing:
+            raise ValueError(f"{path}: expected the column {missing[0]} beside {present[0]}")
+
+
 def read_flight(path: Path) -> pd.DataFrame:
     """Read a recorded flight; angles become rad, the yaw continuous.
 
@@ -80,17 +106,35 @@ def read_flight(path: Path) -> pd.DataFrame:
     try:
         table = pd.read_csv(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected a recorded flight as CSV ({error})") from error
-    missing = [column for column in FLIGHT_COLUMNS if column not in table]
-    if missing:
-        raise ValueError(f"{path}: expected the column {missing[0]} in a recorded flight")
+        why = str(error).strip().splitlines()[0]
+        raise ValueError(f"{path}: expected a recorded flight as CSV ({why})") from error
+    table = table.rename(columns=str.strip)
+    _require_columns(path, list(table.columns))
+    table = table[[column for column in table if column in _COLUMNS]].copy()
     for column in table:
         values = pd.to_numeric(table[column], errors="coerce")
-        if values.isna().any() and (column in FLIGHT_COLUMNS or values.isna().all()):
-            raise ValueError(f"{path}: expected numbers in the column {column}")
+        empty = table[column].isna()
+        wrong = (values.isna() & ~empty) | np.isinf(values)
+        if column in FLIGHT_COLUMNS:
+            wrong |= empty
+        elif empty.all():
+            raise ValueError(f"{path}: expected numbers in the column {column}, but it is empty")
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise ValueError(
+                f"{path}: expected numbers in the column {column}, found "
+                f"{'nothing' if empty[row] else table[column][row]} in row {row + 1}"
+            )
         table[column] = np.radians(values) if column in _IN_DEGREES else values
-    if len(table) < 2 or not (np.diff(table["time"]) > 0.0).all():
-        raise ValueError(f"{path}: expected at least two rows with rising time")
+    if len(table) < 2:
+        raise ValueError(f"{path}: expected at least two rows, found {len(table)}")
+    late = np.diff(table["time"]) <= 0.0
+    if late.any():
+        row = int(np.argmax(late)) + 1
+        raise ValueError(
+            f"{path}: expected rising times, but row {row + 1} has {table['time'][row]:g} s after "
+            f"{table['time'][row - 1]:g} s"
+        )
     table["time"] -= table["time"].iloc[0]
     table["yaw"] = np.unwrap(table["yaw"])
     return table

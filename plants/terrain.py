@@ -5,6 +5,7 @@ The studies of section 6.1 use formulas along the runway's axis (Figs. 18, 19);
 are relative to the touch-down point, upwards.
 """
 
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,13 @@ class TerrainGrid:
 
     values: np.ndarray
     geometry: np.ndarray
+
+    def covers(self, north: float, east: float) -> bool:
+        """Whether a point in NED (m) lies within the grid, not beyond its edges."""
+        a0, b0, da, db, c, s = self.geometry
+        i, j = (c * north + s * east - a0) / da, (c * east - s * north - b0) / db
+        rows, columns = self.values.shape
+        return bool(0.0 <= i <= rows - 1 and 0.0 <= j <= columns - 1)
 
     def elevation(self, north: float, east: float) -> float:
         """The elevation (m) of the ground at a point in NED (m)."""
@@ -114,6 +122,7 @@ class SlopeTerrain:
 
     def grid(self, runway: RunwayConfig) -> TerrainGrid:
         """The grid of elevations about `runway`."""
+        _require_on_grid("until", self.until)
         far = _ALONG[0]
         top = self.gradient * (-far - self.until)
         return _profile(20.0, np.array([[far, top], [-self.until, 0.0]]), runway)
@@ -129,6 +138,7 @@ class CliffTerrain:
 
     def grid(self, runway: RunwayConfig) -> TerrainGrid:
         """The grid of elevations about `runway`."""
+        _require_on_grid("at", self.at)
         return _profile(5.0, _step(self.at, -self.drop), runway)
 
 
@@ -142,6 +152,7 @@ class PlateauTerrain:
 
     def grid(self, runway: RunwayConfig) -> TerrainGrid:
         """The grid of elevations about `runway`."""
+        _require_on_grid("at", self.at)
         return _profile(5.0, _step(self.at, self.rise), runway)
 
 
@@ -156,6 +167,7 @@ class ObstacleTerrain:
 
     def grid(self, runway: RunwayConfig) -> TerrainGrid:
         """The grid of elevations about `runway`."""
+        _require_on_grid("at", self.at + self.length)
         a, b, h = -self.at - self.length, -self.at, self.height
         return _profile(2.5, np.array([[a - 2.5, 0.0], [a, h], [b, h], [b + 2.5, 0.0]]), runway)
 
@@ -176,6 +188,7 @@ class CoastalTerrain:
 
     def grid(self, runway: RunwayConfig) -> TerrainGrid:
         """The grid of elevations about `runway`; the sea is at mean sea level."""
+        _require_on_grid("cliff", self.cliff)
         along = np.arange(_ALONG[0], _ALONG[1] + 20.0, 20.0)
         across = np.arange(-8000.0, 8001.0, 40.0)
         Y, X = np.meshgrid(along, across, indexing="ij")
@@ -234,9 +247,11 @@ class TerrainFile:
             n = [south - self.northing, north - self.northing]
             e = [west - self.easting, east - self.easting]
         if not (n[0] <= 0.0 <= n[1] and e[0] <= 0.0 <= e[1]):
+            degrees = west <= runway.longitude <= east and south <= runway.latitude <= north
             raise ValueError(
                 f"{self.path}: expected a grid that covers the touch-down point, but it spans "
                 f"{n[0]:.0f} to {n[1]:.0f} m north and {e[0]:.0f} to {e[1]:.0f} m east of it"
+                + (": set coordinates to degrees?" if degrees else "")
             )
         geometry = np.array(
             [n[0], e[0], (n[1] - n[0]) / (rows - 1), (e[1] - e[0]) / (columns - 1), 1.0, 0.0]
@@ -255,6 +270,14 @@ Terrain = Annotated[
     | TerrainFile,
     Field(discriminator="kind"),
 ]
+
+
+def _require_on_grid(field: str, distance: float) -> None:
+    if distance >= -_ALONG[0]:
+        raise ValueError(
+            f"terrain.{field}: expected less than {-_ALONG[0]:g} m before the touch-down point, "
+            f"where the terrain's grid ends, found {distance:g}"
+        )
 
 
 def _step(at: float, elevation: float) -> np.ndarray:
@@ -286,7 +309,13 @@ def read_grid(path: Path) -> tuple[np.ndarray, float, float, float, float]:
     else:
         raise ValueError(f"{path}: expected a GeoTIFF (.tif, .tiff) or an ESRI ASCII grid (.asc)")
     if values.ndim != 2 or min(values.shape) < 2:
-        raise ValueError(f"{path}: expected at least 2 x 2 elevations, found {values.shape}")
+        found = " x ".join(str(length) for length in values.shape)
+        raise ValueError(f"{path}: expected one band of at least 2 x 2 elevations, found {found}")
+    if not (math.isfinite(west + north) and 0.0 < step_x < math.inf and 0.0 < step_y < math.inf):
+        raise ValueError(
+            f"{path}: expected a finite origin and cells of positive size, found steps of "
+            f"{step_x:g} and {step_y:g} from ({west:g}, {north:g})"
+        )
     if not np.isfinite(values).all() or (nodata is not None and (values == nodata).any()):
         raise ValueError(f"{path}: expected an elevation at every point, but some are missing")
     return values, west, north, step_x, step_y
@@ -306,12 +335,19 @@ def _read_esri_ascii(path: Path) -> tuple[np.ndarray, float, float, float, float
         centred = "xllcenter" in header
         x = header["xllcenter"] if centred else header["xllcorner"] + 0.5 * cell
         y = header["yllcenter"] if centred else header["yllcorner"] + 0.5 * cell
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, OverflowError) as error:
         raise ValueError(f"{path}: expected {wanted}") from error
     if columns < 2 or rows < 2 or not cell > 0.0:
         raise ValueError(f"{path}: expected at least 2 x 2 cells of positive size in the header")
+    body = [line.split() for line in lines[first:] if line.strip()]
+    if len(body) == rows:  # else the lines are no rows, which the format allows
+        for row, line in enumerate(body, start=1):
+            if len(line) != columns:
+                raise ValueError(
+                    f"{path}: expected {columns} elevations in row {row} (ncols), found {len(line)}"
+                )
     try:
-        values = np.array(" ".join(lines[first:]).split(), dtype=float)
+        values = np.array([value for line in body for value in line], dtype=float)
     except ValueError as error:
         raise ValueError(f"{path}: expected numbers after the header") from error
     if values.size != rows * columns:
@@ -323,24 +359,35 @@ def _read_esri_ascii(path: Path) -> tuple[np.ndarray, float, float, float, float
 
 
 def _read_geotiff(path: Path) -> tuple[np.ndarray, float, float, float, float, float | None]:
+    log = logging.getLogger("tifffile")
+    level = log.level
+    log.setLevel(logging.CRITICAL)  # what it would log of a broken file is said below
     try:
         with tifffile.TiffFile(path) as tiff:
             page = tiff.pages.first
             values = page.asarray().astype(float)
-            scale = page.tags.get("ModelPixelScaleTag")
-            tie = page.tags.get("ModelTiepointTag")
+            tags = {name: page.tags[name].value for name in _GEOTIFF_TAGS if name in page.tags}
             keys = page.geotiff_tags or {}
-            marker = page.tags.get("GDAL_NODATA")
+        scale, tie = (
+            [float(value) for value in np.ravel(tags.get(name, ()))] for name in _GEOTIFF_TAGS[:2]
+        )
+        marker = tags.get("GDAL_NODATA")
+        nodata = None if marker is None else float(str(marker).strip("\x00 "))
     except (tifffile.TiffFileError, ValueError, OSError, IndexError) as error:
-        raise ValueError(f"{path}: expected a readable GeoTIFF ({error})") from error
-    if scale is None or tie is None:
+        why = "it has no page" if isinstance(error, IndexError) else error
+        raise ValueError(f"{path}: expected a readable GeoTIFF ({why})") from error
+    finally:
+        log.setLevel(level)
+    if len(scale) < 2 or len(tie) < 6:
         raise ValueError(f"{path}: expected a GeoTIFF with ModelPixelScale and ModelTiepoint tags")
-    step_x, step_y = float(scale.value[0]), float(scale.value[1])
-    column, row, _, x, y, _ = (float(value) for value in tie.value[:6])
+    step_x, step_y = scale[:2]
+    column, row, _, x, y, _ = tie[:6]
     # RasterPixelIsArea (1, the default): the tie point is the pixel's corner, not its centre
     raster_type = keys.get("GTRasterTypeGeoKey", 1)
     half = 0.5 if int(raster_type) == 1 else 0.0
     west = x + (half - column) * step_x
     north = y - (half - row) * step_y
-    nodata = None if marker is None else float(str(marker.value).strip("\x00 "))
     return values, west, north, step_x, step_y, nodata
+
+
+_GEOTIFF_TAGS = ("ModelPixelScaleTag", "ModelTiepointTag", "GDAL_NODATA")

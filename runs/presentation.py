@@ -13,6 +13,7 @@ from runs.plots import RunPlots
 from runs.px4_topics import px4_topics
 from runs.replay_3d import live_view, replay_html
 from runs.runway_plots import RunwayPlots
+from runs.runway_replay_3d import runway_live_view, runway_replay_html
 from runs.svgs_plots import SvgsPlots
 from runs.ulog import write_ulog
 
@@ -107,5 +108,7 @@ PRESENTATIONS: dict[str, Presentation] = {
         plots_note="The landing against the distance to go, as in the thesis's Figs. 43 to 51.",
         frames_note=_runway_frames,
         frame_period=15.0,
+        replay=runway_replay_html,
+        live=runway_live_view,
     ),
 }

@@ -17,7 +17,7 @@ from systems.signals.measurement import BODY_STATE, PAD_STATE
 
 _LIVE_PERIOD = 0.04  # s of simulated time between two poses of the live view
 _TRACK = Rgba(0.0, 0.45, 0.70, 1.0)
-_PATH = "/plumbline"
+PATH = "/plumbline"
 
 
 @cache
@@ -38,19 +38,24 @@ def replay_html(scenario: MultirotorLanding, log: pa.Table) -> str:
         Whose ports `body` and `pad` to follow.
     """
     scene = _scene(scenario)
-    body, pad = _rows(log, "body", BODY_STATE.fields), _rows(log, "pad", PAD_STATE.fields)
+    body, pad = rows(log, "body", BODY_STATE.fields), rows(log, "pad", PAD_STATE.fields)
     track = body[::4, BODY_STATE.slice("p_WB")].T
-    scene.SetLine(f"{_PATH}/track", np.asfortranarray(track), 2.0, _TRACK)
+    scene.SetLine(f"{PATH}/track", np.asfortranarray(track), 2.0, _TRACK)
     move(scene, body[0], pad[0])
     period = scenario.recording.period
     scene.StartRecording(1.0 / period, set_visualizations_while_recording=False)
     for frame in range(len(body)):
         # half a frame later, because Meshcat rounds down
         move(scene, body[frame], pad[frame], (frame + 0.5) * period)
+    return recorded_page(scene)
+
+
+def recorded_page(scene: Meshcat) -> str:
+    """The self-contained page of what has been recorded; clears the scene."""
     scene.StopRecording()
     scene.PublishRecording()
     page = scene.StaticHtml()
-    scene.Delete(_PATH)
+    scene.Delete(PATH)
     scene.DeleteRecording()
     return page
 
@@ -76,21 +81,30 @@ def live_view(landing: LandingDiagram, scenario: MultirotorLanding) -> Callable:
 
 def _scene(scenario: MultirotorLanding) -> Meshcat:
     """Meshcat with the vehicle, the pad and the ground, and a camera that sees the flight."""
+    scene = empty_scene()
+    phone = scenario.sensors.svgs_camera
+    beacons = None if phone is None else phone.sensor.beacons
+    draw(scene, scenario.vehicle.resolved_vehicle(), scenario.pad, PATH, beacons)
+    scene.SetCameraPose(np.array([-3.2, -5.2, 2.8]), np.array([0.4, 0.0, 1.0]))
+    return scene
+
+
+def empty_scene(near: float = 0.01, far: float = 100.0) -> Meshcat:
+    """Meshcat with sky and light alone, seen from `near` to `far` (m)."""
     scene = meshcat()
-    scene.Delete(_PATH)
+    scene.Delete(PATH)
+    for name, distance in (("near", near), ("far", far)):
+        scene.SetProperty("/Cameras/default/rotated/<object>", name, distance)
     scene.SetProperty("/Grid", "visible", False)
     scene.SetProperty("/Axes", "visible", False)
     scene.SetProperty("/Background", "top_color", [0.62, 0.74, 0.88])
     scene.SetProperty("/Background", "bottom_color", [0.93, 0.95, 0.97])
     scene.SetProperty("/Lights/AmbientLight/<object>", "intensity", 1.2)
     scene.SetProperty("/Lights/FillLight/<object>", "intensity", 1.0)
-    phone = scenario.sensors.svgs_camera
-    beacons = None if phone is None else phone.sensor.beacons
-    draw(scene, scenario.vehicle.resolved_vehicle(), scenario.pad, _PATH, beacons)
-    scene.SetCameraPose(np.array([-3.2, -5.2, 2.8]), np.array([0.4, 0.0, 1.0]))
     return scene
 
 
-def _rows(log: pa.Table, port: str, fields: tuple[str, ...]) -> np.ndarray:
+def rows(log: pa.Table, port: str, fields: tuple[str, ...]) -> np.ndarray:
+    """The samples of a port, shape (n, fields)."""
     samples = port_samples(log, port)
     return np.column_stack([samples[field] for field in fields])

@@ -99,6 +99,8 @@ class RunwaySensor(LeafSystem):
     def _update(self, context, discrete_state):
         time = context.get_time()
         sampling = round(time / self.look) % self._every == 0
+        if not (sampling or self._delay):
+            return
         pipeline = discrete_state.get_mutable_value(1)
         if not sampling and pipeline[1] == 0.0:
             return

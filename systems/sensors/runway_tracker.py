@@ -28,7 +28,7 @@ from systems.signals.runway_measurement import (
     release,
 )
 
-_CAPACITY = 32
+PICTURES_UNDER_WAY = 32  # at most; the newest is lost beyond
 
 
 @configuration
@@ -130,7 +130,7 @@ class RunwayTracker(LeafSystem):
         self._picture = self.DeclareVectorInputPort("picture", PICTURE.size)
         self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
         output = self.DeclareDiscreteState(no_measurement(PICTURE))
-        self.DeclareDiscreteState(2 + _CAPACITY * (PICTURE.size + 1))
+        self.DeclareDiscreteState(2 + PICTURES_UNDER_WAY * (PICTURE.size + 1))
         self.DeclareStateOutputPort("measurement", output)
         self.DeclarePeriodicDiscreteUpdateEvent(PICTURE_PERIOD, ACT_OFFSET, self._update)
 

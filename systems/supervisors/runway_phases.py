@@ -32,6 +32,8 @@ class Phase(IntEnum):
     STANDSTILL = 6
 
 
+_STANDBY, _STANDSTILL = int(Phase.STANDBY), int(Phase.STANDSTILL)  # an enumeration is slow to ask
+
 TABLE = TransitionTable(
     initial="standby",
     states=(
@@ -182,7 +184,7 @@ class RunwayPhases(LeafSystem):
         def read(port):
             return self._inputs[port].Eval(context)
 
-        if status[0] == Phase.STANDBY:
+        if status[0] == _STANDBY:
             fix = read(2)
             status[2] = time - max(fix[0], 0.0) if fix[3] > 0.0 else status[2] + PICTURE_PERIOD
         if read(4)[3] > 0.0:
@@ -192,7 +194,7 @@ class RunwayPhases(LeafSystem):
         after = self._machine.next_state(before, now)
         status[0] = after
         status[1] = 0.0 if after != before else status[1] + PICTURE_PERIOD
-        status[3] = float(after == Phase.STANDSTILL)
-        if after == Phase.STANDSTILL and status[1] >= self._config.settle:
+        status[3] = float(after == _STANDSTILL)
+        if after == _STANDSTILL and status[1] >= self._config.settle:
             return EventStatus.ReachedTermination(self, "at a standstill")
         return EventStatus.Succeeded()

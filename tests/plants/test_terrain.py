@@ -132,7 +132,7 @@ def test_esri_ascii_in_metres(tmp_path):
     ("name", "text", "message"),
     [
         ("a.asc", "no header\n1 2 3", "expected the ESRI ASCII header"),
-        ("b.asc", ASCII.replace("92", ""), "expected 2 x 3 elevations after the header, found 5"),
+        ("b.asc", ASCII.replace("92", ""), "expected 3 elevations in row 2 .ncols., found 2"),
         ("c.asc", ASCII.replace("92", "x"), "expected numbers after the header"),
         ("d.asc", ASCII.replace("92", "-9999"), "expected an elevation at every point"),
         ("e.asc", ASCII.replace("cellsize 10.0", "cellsize 0"), "cells of positive size"),

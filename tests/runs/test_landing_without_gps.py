@@ -16,8 +16,10 @@ from diagrams.landing_without_gps import (
     LandingWithoutGpsScenario,
 )
 from diagrams.loading import load_scenario
+from diagrams.runway_geometry import require_landing
 from plants.fixed_wing import FixedWingConfig
 from plants.recorded_flight import FLIGHT_COLUMNS, RecordedFlightConfig, write_flight
+from plants.terrain import CliffTerrain
 from plumbline.command_line import cli
 from runs.compiled_landing import fly_compiled
 from runs.landing_without_gps import simulate_landing
@@ -195,6 +197,18 @@ def test_the_report_draws_what_the_thesis_draws(tmp_path):
     assert json.dumps(result.summary(), allow_nan=True)
 
 
+def grid(edge, elevation):
+    """An ESRI ASCII grid of 3 x 3 points about the touch-down point."""
+    header = f"ncols 3\nnrows 3\nxllcenter {-edge}\nyllcenter {-edge}\ncellsize {edge}\n"
+    return header + 3 * f"{elevation} {elevation} {elevation}\n"
+
+
+def flight(down):
+    """Two seconds of a recorded flight past 1300 m before the touch-down point."""
+    header = "time,north,east,down,v_north,v_east,v_down,yaw,pitch,roll\n"
+    return header + "".join(f"{k},{k - 1300},0,{down},33,0,0,42,0,0\n" for k in range(3))
+
+
 GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n"
 
 
@@ -202,10 +216,54 @@ GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n"
     ("override", "parts"),
     [
         ("camera.mounting=[0, 60, 0]", ("camera.mounting", "sees the touch-down point")),
-        ("camera.mounting=[180, 0, 0]", ("camera.mounting", "behind it")),
+        ("camera.mounting=[180, 0, 0]", ("camera.mounting", "behind it", "[0.0, -2.5, 0]")),
+        ("camera.horizontal_field_of_view=0.01", ("horizontal_field_of_view", "at least 1.4 deg")),
+        ("camera.vertical_field_of_view=0.01", ("vertical_field_of_view", "at least 1.2 deg")),
+        ("camera.position=[100, 0, 0]", ("camera.position", "within 20 m")),
+        ("camera.latency=100", ("camera.latency", "at most 1.28 s")),
+        ("laser.delay=10", ("laser.delay", "at most 1.6 s")),
+        ("laser.activation_height=600", ("laser.activation_height", "522 m over the ground")),
+        ("record.distances=[]", ("record.distances", "at least one")),
+        ("runway.length=0", ("runway.length", "greater than 0")),
+        ("runway.length=200", ("runway.length", "at least 237 m")),
+        ("runway.width=.nan", ("runway.width", "finite number")),
+        ("runway.latitude=123", ("runway.latitude", "-89 to 89 deg")),
+        ("runway.ground_station=[1e6, 0, -10]", ("runway.ground_station", "within 107 km")),
+        ("runway.ground_station=[0, 0, 5]", ("runway.ground_station", "at most 0 m")),
+        ("aircraft.start=[0, -5000, 100]", ("aircraft.start", "in the air")),
+        ("aircraft.start=[0, 1000, -100]", ("aircraft.start", "less than -105 m")),
+        ("aircraft.start=[4000, -1000, -100]", ("aircraft.start", "at most 1000 m beside")),
+        ("aircraft.start=[0, -1000, -300]", ("aircraft.start", "at most 167 m above")),
+        ("aircraft.start_course=180", ("aircraft.start_course", "less than 90 deg")),
+        ("aircraft.start_vertical_speed=9", ("start_vertical_speed", "-2.5 to 5.5 m/s")),
+        ("aircraft.speed=10", ("aircraft.speed", "at least 20.6 m/s")),
+        ("aircraft.wind=[40, 0]", ("aircraft.wind", "33 m/s")),
+        ("flight_controller.speed=66", ("flight_controller.speed", "about 33")),
+        ("flight_controller.route.profile.slope=0.5", ("profile.slope", "more than 0.87 deg")),
+        ("flight_controller.route.profile.slope=30", ("profile.slope", "at most 9.5 deg")),
+        ("flight_controller.route.profile.touchdown_sink=9", ("touchdown_sink", "5.5 m/s")),
+        (
+            "flight_controller.route.waypoints=[[0, -9000, -500], [0, -9000, -500]]",
+            ("waypoints.1", "another place"),
+        ),
+        ("terrain={kind: plateau, rise: 200}", ("terrain", "below the landing trajectory")),
+        (
+            "terrain={kind: obstacle, at: 62, height: 12}",
+            ("terrain", "hides it", "m above the line of sight"),
+        ),
+        ("terrain={kind: slope, until: 20000}", ("terrain.until", "less than 12000 m")),
+        ("terrain={kind: slope, gradient: 1}", ("terrain", "-12000 to 9000 m")),
+        ("terrain={kind: file, path: buried.asc, coordinates: metres}", ("altitude", "500 m")),
+        ("terrain={kind: file, path: small.asc, coordinates: metres}", ("end of the runway",)),
+        ("aircraft={kind: recorded_flight, path: brief.csv}", ("brief.csv", "record.distances")),
+        ("aircraft={kind: recorded_flight, path: low.csv}", ("low.csv", "500 m below")),
+        ("tracker.clicks=[800, 2000, 4500]", ("tracker.clicks", "[4500.0, 2000.0, 800.0]")),
         ("tracker.clicks=[50, 40, 30]", ("tracker.clicks", "loss_distance")),
         ("terrain={kind: file, path: nowhere.asc}", ("nowhere.asc", "no such file")),
-        ("terrain={kind: file, path: short.asc}", ("short.asc", "expected 2 x 2 elevations")),
+        (
+            "terrain={kind: file, path: short.asc}",
+            ("short.asc", "expected 2 x 2 elevations", "found 3"),
+        ),
         ("aircraft={kind: recorded_flight, path: nowhere.csv}", ("nowhere.csv", "CSV")),
         ("aircraft={kind: recorded_flight, path: empty.csv}", ("empty.csv", "CSV")),
         ("aircraft={kind: recorded_flight, path: torn.csv}", ("torn.csv", "column v_north")),
@@ -216,6 +274,10 @@ GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n"
 def test_wrong_input_is_one_sentence_and_ends_with_2(override, parts, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "short.asc").write_text(GRID)
+    (tmp_path / "buried.asc").write_text(grid(3000.0, 500.0))
+    (tmp_path / "small.asc").write_text(grid(300.0, 89.0))
+    (tmp_path / "brief.csv").write_text(flight(-150.0))
+    (tmp_path / "low.csv").write_text(flight(500.0))
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "torn.csv").write_text("time,north,east,down\n0,1,2,3\n")
     arguments = ["land", "landing-without-gps-final", "--set", override, "--out", "out"]
@@ -226,3 +288,22 @@ def test_wrong_input_is_one_sentence_and_ends_with_2(override, parts, tmp_path, 
     assert "\n" not in sentence
     for part in parts:
         assert part in sentence
+
+
+@pytest.mark.parametrize("name", ["landing-without-gps", "landing-without-gps-final"])
+def test_the_scenarios_of_the_laboratory_are_possible(name):
+    scenario = load_scenario(name)
+    require_landing(scenario, scenario.terrain.grid(scenario.runway))
+
+
+def test_seeds_are_not_checked_again(monkeypatch):
+    """A campaign's runs differ in the seed, and the checks cost as much as half a landing."""
+    landing = LandingWithoutGpsDiagram(CLOSED)
+    asked = []
+    monkeypatch.setattr(
+        "diagrams.landing_without_gps.require_landing", lambda *_: asked.append(True)
+    )
+    landing.configure(dataclasses.replace(CLOSED, seed=7))
+    assert not asked
+    landing.configure(dataclasses.replace(CLOSED, seed=7, terrain=CliffTerrain()))
+    assert asked
