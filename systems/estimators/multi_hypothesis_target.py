@@ -76,23 +76,29 @@ class MultiHypothesisTargetConfig:
 
     kind: Literal["multi_hypothesis"] = "multi_hypothesis"
     front_end: TargetSensorsConfig = Field(default_factory=TargetSensorsConfig)
-    # How the pad seems to move in the navigation frame: the filter's own drift, and the pad
-    position_noise: NonNegative = 0.01  # m/√s, random walk of the navigation filter's position
-    horizontal_acceleration: Positive = 0.15  # (m/s)/√s, random walk of the pad's velocity
-    vertical_acceleration: Positive = 0.15  # (m/s)/√s
+    # How a pad at rest seems to move: by the error of EKF2's velocity. Flown with the thesis's
+    # hexacopter, what was seen for a while and then lost for 1, 2, 4 s was 2.0, 4.7, 9.7 cm from
+    # where it was expected, an axis, in 5 m/s of wind, 2.3, 5.6, 12 cm in 10; so by these figures:
+    # 2.2, 5.5, 12 cm
+    drift_speed: Positive = 0.05  # m/s, one sigma of the velocity's error
+    drift_time: Positive = 2.5  # s, of its correlation
+    position_noise: NonNegative = 0.005  # m/√s, of the odometry besides
+    # How it moves itself
+    horizontal_acceleration: Positive = 0.15  # (m/s)/√s, random walk of the velocity
+    vertical_acceleration: Positive = 0.15  # (m/s)/√s, at rest too, where the height's error is it
+    initial_speed: Positive = 1.5  # m/s, one sigma, of a new hypothesis or of one that sets off
     # Attitude error and misalignment of the cameras, a first-order Gauss-Markov process
     bearing_bias: NonNegative = 0.01  # rad, one sigma
     bearing_bias_time: Positive = 30.0  # s, of correlation
     initial_radius: Positive = 5.0  # m, one sigma of a new hypothesis
-    initial_speed: Positive = 1.5  # m/s, one sigma of the pad's speed
     gate_probability: Probability = 0.999  # of a true measurement to be inside the gate
     late_probability: Probability = 1e-3  # that a target seen after the first one is the pad
-    marker_odds: Positive = 0.5  # 1, log of the odds that each marker measurement adds; frames
-    # are not independent, so much less than one code's odds of ln 1000
+    marker_odds: Positive = 6.9  # 1, log of the odds that a marker measurement adds: of 1000 codes
+    marker_time: Seconds = 0.5  # s, within which two measurements are not independent
     marker_odds_limit: Positive = 12.0  # 1, and no more than this
-    confirmations: int = Field(default=8, ge=1)  # measurements before the target is acquired
-    lost_time: Seconds = 1.0  # s without a camera measurement
-    forget_time: Seconds = 10.0  # s, after which an unseen hypothesis gives way to a seen one
+    known_radius: Positive = 1.0  # m, one sigma in a second from now, to which a place is known
+    forget_radius: Positive = 3.0  # m, one sigma, at which a hypothesis says nothing any more
+    forget_time: Seconds = 10.0  # s, by which another must have been seen longer to remain alone
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "MultiHypothesisTarget":
         """Add an estimator called `name` to `builder`."""
@@ -124,18 +130,25 @@ class MultiHypothesisTarget(LeafSystem):
     | `measurement` | `TARGET_MEASUREMENT` | the newest camera measurement fused into it |
     | `hypotheses` | `TARGET_HYPOTHESES` | all hypotheses with their probabilities |
 
-    State of a hypothesis: the pad's place p and velocity v as they appear in the navigation
-    filter's frame (so that v holds the filter's own velocity error, which the controller has
-    too), and a bearing bias b of both cameras, attitude error and misalignment together:
+    State of a hypothesis: the pad's place p and velocity v as they appear to the vehicle's
+    odometry, the integral of the navigation filter's velocity, and a bearing bias b of both
+    cameras, attitude error and misalignment together:
 
-        ṗ = v + √position_noise² w_p,   v̇ = √acceleration² w_v,   ḃ = −b/τ + σ √(2/τ) w_b
+        ṗ = v + position_noise w_p,   ḃ = −b/τ_b + σ_b √(2/τ_b) w_b
+        v̇ = −v/τ + σ √(2/τ) w_v            at rest: the odometry's error, σ = drift_speed
+        v̇ = horizontal_acceleration w_v    moving; vertically always, by vertical_acceleration
 
-    Measurements, with the vehicle's pose p_WB, q_WB at the measurement's own time of validity
-    (interpolated in a memory of 2 s), h the height above the pad:
+    Odometry, because the navigation filter's position follows that of its GNSS receiver, by some
+    9 cm in two seconds, and its velocity does not: half of that. It has no resets either. A
+    hypothesis moves if the odometry does not explain its velocity, Σ v_i²/(P_ii + σ²) over the
+    chi-square gate. Then v is the pad's with the odometry's error, which the controller has too.
 
-        marker      p_BP_W = p − p_WB + h (b, 0)                              three rows
-        infrared    0 = (p − p_WC)_xy − (d_xy/d_z)(p − p_WC)_z + h b          two rows a blob
-        range       p_z = p_WB.z − height, less certain where the beam misses the pad
+    Measurements, with the vehicle's odometry p_OB and attitude q_WB at the measurement's own time
+    of validity (interpolated in a memory of 2 s), h the height above the pad:
+
+        marker      p_BP_W = p − p_OB + h (b, 0)                              three rows
+        infrared    0 = (p − p_OC)_xy − (d_xy/d_z)(p − p_OC)_z + h b          two rows a blob
+        range       p_z = p_OB.z − height, less certain where the beam misses the pad
 
     d is the blob's ray in W. Latency needs no parameter. A measurement that comes after a younger
     one is put in its place among the last 48, and all behind it are filtered anew: exactly the
@@ -153,21 +166,30 @@ class MultiHypothesisTarget(LeafSystem):
 
     Hypotheses (a small multiple hypothesis tracker, one association each; Blackman,
     "Multiple hypothesis tracking for multiple target tracking", IEEE AESM 19(1), 2004). A
-    measurement belongs to the hypothesis under which it is likeliest, νᵀ S⁻¹ ν + ln |S|; where
-    νᵀ S⁻¹ ν exceeds the chi-square gate for all of them, it begins another one. So a gate never
-    gives in: what persists outside of it becomes a rival that has to win by evidence,
+    measurement belongs to the hypothesis under which it is likeliest, νᵀ S⁻¹ ν + ln |S|. Where
+    νᵀ S⁻¹ ν exceeds the chi-square gate for all of them, it belongs to one whose velocity may have
+    changed at once, by `initial_speed`: the marker's code names the pad; a blob does not, and must
+    be where nothing else can be, within 0.25 m (one sigma) since it was last seen. Otherwise it
+    begins another hypothesis. So a gate never gives in: what persists outside of it becomes a
+    rival that has to win by evidence,
 
-        ln odds = (first: 0; later: ln late_probability) + min(marker_odds · n, limit)
+        ln odds = (first: 0; later: ln late_probability)
+                  + min(Σ marker_odds (1 − e^(−Δt/marker_time)), limit)
 
-    n being the marker measurements that belong to it, less those that belonged elsewhere while
-    nothing was seen of it: the marker's code tells the pad from a lamp.
+    over the marker measurements that belong to it, less those that belonged elsewhere while
+    nothing was seen of it: the marker's code tells the pad from a lamp, and what follows the
+    measurement before it after Δt tells little new.
     A lamp that appears later than the pad, or without a marker on it, loses for as long as
     the pad is seen, and `forget_time` longer; then what is left inherits. Rivals within 0.25 m
     are one. `target` is the most probable hypothesis i, its
     covariance that of the mixture, P_i + Σ probability_j (p_j − p_i)².
 
-    The target is acquired after `confirmations` camera measurements, and as long as the last is
-    not older than `lost_time`.
+    Nothing is counted, as frames come from once to fifty times a second. A hypothesis is known,
+    and then begins to rival others, while its place will be known to `known_radius` in a second
+    from now: after a few frames, when its velocity is, and for as long as nobody has to see it,
+    which is some seconds for a pad that moves and a minute for one at rest. The target is
+    acquired while it is known; how well is told by its variance, when it was last seen by
+    `time_of_last_fusion`. A hypothesis uncertain to `forget_radius` is given up.
 
     | event | when | does |
     |---|---|---|
@@ -189,7 +211,7 @@ class MultiHypothesisTarget(LeafSystem):
         self._estimate = declare("estimate", VEHICLE_ESTIMATE.size).Eval
         memory = MEMORY(MEMORY.zeros())
         memory.infrared_arrival = memory.marker_arrival = memory.range_arrival = -1.0
-        memory.horizontal_resets = memory.vertical_resets = -1.0
+        memory.code_seen = -np.inf
         tracks = np.zeros((HYPOTHESES, TRACK))
         tracks[:, BORN] = -1.0
         target = self.DeclareDiscreteState(BasicVector(no_target()))
@@ -207,17 +229,20 @@ class MultiHypothesisTarget(LeafSystem):
         self.config = config
         c, s = config, config.front_end
         k = PARAMETERS(PARAMETERS.zeros())
-        k.density_position = c.position_noise**2
-        k.density_horizontal = c.horizontal_acceleration**2
-        k.density_vertical = c.vertical_acceleration**2
-        k.bias_sigma = c.bearing_bias
-        k.bias_time = c.bearing_bias_time
+        k.density_position_at_rest = k.density_position_moving = c.position_noise**2
+        k.density_horizontal_at_rest = 2.0 * c.drift_speed**2 / c.drift_time
+        k.density_horizontal_moving = c.horizontal_acceleration**2
+        k.density_vertical_at_rest = k.density_vertical_moving = c.vertical_acceleration**2
+        k.velocity_time_at_rest, k.velocity_time_moving = c.drift_time, np.inf
+        k.bias_sigma_at_rest = k.bias_sigma_moving = c.bearing_bias
+        k.bias_time_at_rest = k.bias_time_moving = c.bearing_bias_time
         k.sources = _SOURCES[s.mode]
         for name in ("infrared_angle_noise", "infrared_lamp_noise", "marker_noise",
                      "attitude_noise", "range_noise", "ground_noise", "pad_radius"):  # fmt: skip
             setattr(k, name, getattr(s, name))
-        for name in ("initial_radius", "initial_speed", "marker_odds", "marker_odds_limit",
-                     "confirmations", "lost_time", "forget_time"):  # fmt: skip
+        for name in ("drift_speed", "initial_radius", "initial_speed", "marker_odds", "marker_time",
+                     "marker_odds_limit", "known_radius", "forget_radius",
+                     "forget_time"):  # fmt: skip
             setattr(k, name, getattr(c, name))
         k.gate_2, k.gate_3 = chi2.ppf(c.gate_probability, (2, 3))
         k.late_odds = float(np.log(c.late_probability))

@@ -8,7 +8,8 @@ estimates are kept, with the covariance of their errors and those of the oldest 
 even older measurement can still be fused there.
 
 A measurement is at most three rows that are linear in the pad's position p and the bearing bias b,
-whitened: value = h_p · p + h_b · b + N(0, 1).
+whitened: value = h_p · p + h_b · b + N(0, 1). It may say that the pad's velocity has changed at
+once some time before: a kick.
 """
 
 import math
@@ -16,7 +17,7 @@ import math
 import numpy as np
 from numba import njit
 
-STATES = 8  # p (m), v (m/s) in the navigation frame; b (rad)
+STATES = 8  # p (m), v (m/s) by odometry; b (rad)
 _PACKED = STATES * (STATES + 1) // 2
 ROW = 6  # coefficients of p (3) and b (2), value
 ROWS = 3
@@ -25,17 +26,19 @@ ROWS = 3
 (
     BORN,  # s, when it began; -1 the track is not in use
     PRIOR,  # log of the odds at its beginning
-    MARKERS,  # marker measurements fused
+    CODE,  # log of the odds that the marker's code has added
     FUSED,  # s, validity of the newest camera measurement fused
     SEEN,  # s, when the last one was fused
     COUNT,  # camera measurements fused
+    MOVES,  # 0/1, the pad itself moves
     USED,  # slots in use
-) = range(7)
-HEADER = 7
+) = range(8)
+HEADER = 8
 
 # A slot.
 TIME, ROW_COUNT = 0, 1  # s; 1
-_FIRST_ROW = 2
+KICK, SINCE = 2, 3  # (m/s)2, variance of a change of the horizontal velocity; s, so long before
+_FIRST_ROW = 4
 _X = _FIRST_ROW + ROWS * ROW
 _P = _X + STATES
 SLOT = _P + _PACKED
@@ -51,17 +54,19 @@ ARCHIVE_INTERVAL = 0.1  # s
 _ARCHIVE = HEADER + SLOTS * SLOT
 TRACK = _ARCHIVE + ARCHIVE * _ARCHIVED
 
-OBSERVATION = _X  # size of a measurement: time, number of rows, rows
+OBSERVATION = _X  # size of a measurement: time, number of rows, kick, its time, rows
 
 # The process noise, in the order of the parameters of the functions below.
-NOISE = 5
+NOISE = 6
 (
-    DENSITY_POSITION,  # m2/s, of the navigation filter's position
-    DENSITY_HORIZONTAL,  # m2/s3, of the pad's apparent acceleration
+    DENSITY_POSITION,  # m2/s, of the odometry
+    DENSITY_HORIZONTAL,  # m2/s3, of the apparent acceleration
     DENSITY_VERTICAL,  # m2/s3
+    VELOCITY_TIME,  # s, of correlation of the horizontal velocity; infinite where it goes on
     BIAS_SIGMA,  # rad, stationary
     BIAS_TIME,  # s, of correlation
 ) = range(NOISE)
+_SHORT = 0.01  # 1, of the correlation time
 
 
 @njit(cache=True)
@@ -91,6 +96,49 @@ def _store(track, slot, x, P):
 
 
 @njit(cache=True)
+def _transition(dt, noise):
+    """How v_xy and b decay in dt (s), and how far v_xy gets, s: F without its ones.
+
+    ∫ exp(−s/τ) ds = τ (1 − exp(−dt/τ)), dt where τ is infinite.
+    """
+    tau = noise[VELOCITY_TIME]
+    reach = dt if math.isinf(tau) else -tau * math.expm1(-dt / tau)
+    return math.exp(-dt / tau), math.exp(-dt / noise[BIAS_TIME]), reach
+
+
+@njit(cache=True)
+def _advance_rows(A, dt, slow, decay, reach):
+    """A ← F A in place, A of shape (8, n)."""
+    for j in range(A.shape[1]):
+        for i in range(2):
+            A[i, j] += reach * A[3 + i, j]
+            A[3 + i, j] *= slow
+            A[6 + i, j] *= decay
+        A[2, j] += dt * A[5, j]
+
+
+@njit(cache=True)
+def _wander(span, tau):
+    """Variances of p and v and their covariance from white acceleration of density 1 in span (s).
+
+    Of v̇ = −v/τ + w; for short spans by their series, as differences of nearly equal numbers say
+    nothing.
+    """
+    share = span / tau
+    if share < _SHORT:
+        square = share * share
+        return (
+            span * span * span * (1.0 / 3.0 - share / 4.0 + 7.0 / 60.0 * square),
+            span * span * (0.5 - 0.5 * share + 7.0 / 24.0 * square),
+            span * (1.0 - share + 2.0 / 3.0 * square),
+        )
+    gone = -math.expm1(-share)
+    left = 1.0 - gone
+    vv = 0.5 * tau * (1.0 - left * left)
+    return tau * tau * (span - 2.0 * tau * gone + vv), 0.5 * tau * tau * gone * gone, vv
+
+
+@njit(cache=True)
 def predict(x, P, dt, noise):
     """Predict x (8,) and P (8, 8) by dt (s) in place; back where dt is negative.
 
@@ -100,31 +148,34 @@ def predict(x, P, dt, noise):
     """
     if dt == 0.0:
         return
-    decay = math.exp(-dt / noise[BIAS_TIME])
-    for i in range(3):
-        x[i] += dt * x[3 + i]
-    x[6] *= decay
-    x[7] *= decay
-    for j in range(STATES):
-        for i in range(3):
-            P[i, j] += dt * P[3 + i, j]
-        P[6, j] *= decay
-        P[7, j] *= decay
-    for i in range(STATES):
-        for j in range(3):
-            P[i, j] += dt * P[i, 3 + j]
-        P[i, 6] *= decay
-        P[i, 7] *= decay
+    slow, decay, reach = _transition(dt, noise)
+    _advance_rows(x.reshape(STATES, 1), dt, slow, decay, reach)
+    _advance_rows(P, dt, slow, decay, reach)
+    _advance_rows(P.T, dt, slow, decay, reach)
     span = abs(dt)
+    sign = 1.0 if dt > 0.0 else -1.0
     for i in range(3):
         q = noise[DENSITY_HORIZONTAL] if i < 2 else noise[DENSITY_VERTICAL]
-        P[i, i] += span * noise[DENSITY_POSITION] + span * span * span / 3.0 * q
-        P[i, 3 + i] += 0.5 * dt * span * q
-        P[3 + i, i] += 0.5 * dt * span * q
-        P[3 + i, 3 + i] += span * q
+        pp, pv, vv = _wander(span, noise[VELOCITY_TIME] if i < 2 else math.inf)
+        P[i, i] += span * noise[DENSITY_POSITION] + pp * q
+        P[i, 3 + i] += sign * pv * q
+        P[3 + i, i] += sign * pv * q
+        P[3 + i, 3 + i] += vv * q
     grown = noise[BIAS_SIGMA] * noise[BIAS_SIGMA] * abs(1.0 - decay * decay)
     P[6, 6] += grown
     P[7, 7] += grown
+
+
+@njit(cache=True)
+def _reach(x, P, dt, observation, noise):
+    """Predict to a measurement, before which the velocity may have changed at once."""
+    predict(x, P, dt, noise)
+    kick, since = observation[KICK], observation[SINCE]
+    for i in range(2):
+        P[i, i] += kick * since * since
+        P[i, 3 + i] += kick * since
+        P[3 + i, i] += kick * since
+        P[3 + i, 3 + i] += kick
 
 
 @njit(cache=True)
@@ -222,9 +273,9 @@ def _drop_oldest(track, noise):
     # cov(e, e_k) ← (I − K H) F cov(e, e_k), by the gains that took slot 0 to slot 1
     following = HEADER + SLOT
     dt = track[following + TIME] - time
-    decay = math.exp(-dt / noise[BIAS_TIME])
-    predict(x, P, dt, noise)
     observation = track[following : following + OBSERVATION]
+    slow, decay, reach = _transition(dt, noise)
+    _reach(x, P, dt, observation, noise)
     rows = int(observation[ROW_COUNT])
     h = np.empty((ROWS, STATES))
     gains = np.zeros((ROWS, STATES))
@@ -245,11 +296,7 @@ def _drop_oldest(track, noise):
         if track[start + _A_TIME] < 0.0:
             continue
         C = track[start + _A_C : start + _ARCHIVED].reshape(STATES, STATES)
-        for j in range(STATES):
-            for i in range(3):
-                C[i, j] += dt * C[3 + i, j]
-            C[6, j] *= decay
-            C[7, j] *= decay
+        _advance_rows(C, dt, slow, decay, reach)
         for row in range(rows):
             for j in range(STATES):
                 seen = 0.0
@@ -279,14 +326,10 @@ def _fuse_old(track, observation, noise):
     load(track, 0, x, P)
     _load_archived(track, start, x_k, P_k)
     dt = time - track[start + _A_TIME]
-    decay = math.exp(-dt / noise[BIAS_TIME])
+    slow, decay, reach = _transition(dt, noise)
     predict(x_k, P_k, dt, noise)
     C = track[start + _A_C : start + _ARCHIVED].copy().reshape(STATES, STATES)
-    for i in range(STATES):
-        for j in range(3):
-            C[i, j] += dt * C[i, 3 + j]
-        C[i, 6] *= decay
-        C[i, 7] *= decay
+    _advance_rows(C.T, dt, slow, decay, reach)
     h = np.empty(STATES)
     gain, cross = np.empty(STATES), np.empty(STATES)
     for row in range(int(observation[ROW_COUNT])):
@@ -334,17 +377,18 @@ def _place(track, time):
 
 
 @njit(cache=True)
-def prior(track, time, x, P, noise):
-    """The estimate at `time` for a gate, into x and P; False if that is forgotten.
+def prior(track, observation, x, P, noise):
+    """The estimate for the gate of a measurement, into x and P; False if that is forgotten.
 
     From what is older, or back from the oldest slot.
     """
+    time = observation[TIME]
     place = _place(track, time)
     if place < 0 and _archived(track, time) < 0:
         return False
     slot = max(place, 0)
     load(track, slot, x, P)
-    predict(x, P, time - track[HEADER + slot * SLOT + TIME], noise)
+    _reach(x, P, time - track[HEADER + slot * SLOT + TIME], observation, noise)
     return True
 
 
@@ -403,25 +447,11 @@ def _refilter(track, first, x, P, noise):
     load(track, first - 1, x, P)
     for slot in range(first, int(track[USED])):
         start = HEADER + slot * SLOT
-        predict(x, P, track[start + TIME] - track[start - SLOT + TIME], noise)
-        fuse(x, P, track[start : start + OBSERVATION])
+        dt = track[start + TIME] - track[start - SLOT + TIME]
+        observation = track[start : start + OBSERVATION]
+        _reach(x, P, dt, observation, noise)
+        fuse(x, P, observation)
         _store(track, slot, x, P)
-
-
-@njit(cache=True)
-def shift(track, jump):
-    """Move the whole track by `jump` (m, shape (3,)): the navigation frame has been reset."""
-    for k in range(ARCHIVE):
-        for i in range(3):
-            track[_ARCHIVE + k * _ARCHIVED + _A_X + i] += jump[i]
-    for slot in range(int(track[USED])):
-        start = HEADER + slot * SLOT
-        for i in range(3):
-            track[start + _X + i] += jump[i]
-        for row in range(int(track[start + ROW_COUNT])):
-            r = start + _FIRST_ROW + row * ROW
-            for i in range(3):
-                track[r + 5] += track[r + i] * jump[i]
 
 
 @njit(cache=True)
@@ -442,6 +472,7 @@ def whiten(observation, time, H, values, R, count):
     """
     observation[TIME] = time
     observation[ROW_COUNT] = count
+    observation[KICK] = observation[SINCE] = 0.0
     for i in range(count):
         for j in range(i + 1):
             total = R[i, j]

@@ -10,13 +10,16 @@ from systems.estimators.fused_sensor_kernel import INFRARED_SOURCE, MARKER_SOURC
 from systems.estimators.multi_hypothesis_target_filter import (
     BIAS_SIGMA,
     BORN,
+    CODE,
     COUNT,
     FUSED,
-    MARKERS,
+    KICK,
+    MOVES,
     NOISE,
     OBSERVATION,
     PRIOR,
     SEEN,
+    SINCE,
     STATES,
     TIME,
 )
@@ -39,12 +42,21 @@ from systems.vision.planar_pose import pad_position_from_marker
 PARAMETERS = Layout(
     "MultiHypothesisTargetParameters",
     (
-        # The process noise first, in the order of `multi_hypothesis_target_filter`
-        "density_position",  # m2/s
-        "density_horizontal",  # m2/s3
-        "density_vertical",  # m2/s3
-        "bias_sigma",  # rad
-        "bias_time",  # s
+        # The process noise of a pad at rest and of one that moves come first, both in the order
+        # of `multi_hypothesis_target_filter`
+        *(
+            f"{name}_{pad}"
+            for pad in ("at_rest", "moving")
+            for name in (
+                "density_position",  # m2/s
+                "density_horizontal",  # m2/s3
+                "density_vertical",  # m2/s3
+                "velocity_time",  # s
+                "bias_sigma",  # rad
+                "bias_time",  # s
+            )
+        ),
+        "drift_speed",  # m/s, one sigma of the odometry's
         "sources",  # bits of the sensors that are listened to
         "infrared_angle_noise",  # rad
         "infrared_lamp_noise",  # m
@@ -59,9 +71,10 @@ PARAMETERS = Layout(
         "gate_3",  # 1, with three
         "late_odds",  # 1, log of the odds of a hypothesis that is not the first
         "marker_odds",  # 1, log of the odds that a marker measurement adds
+        "marker_time",  # s, within which two of them tell the same
         "marker_odds_limit",  # 1
-        "confirmations",  # 1
-        "lost_time",  # s
+        "known_radius",  # m
+        "forget_radius",  # m
         "forget_time",  # s
         "range_finder_x",  # m, in B
         "range_finder_y",
@@ -69,7 +82,7 @@ PARAMETERS = Layout(
     ),
 )
 POSES = 128  # polls that are remembered, 2 s
-_POSE = 11  # time, p_WB, q_WB, v_WB
+_POSE = 11  # time, p_OB, q_WB, v_WB
 MEMORY = Layout(
     "MultiHypothesisTargetMemory",
     (
@@ -78,8 +91,7 @@ MEMORY = Layout(
         "range_arrival",
         "polls",  # so far
         "range_polls",  # polls since a range was taken
-        "horizontal_resets",  # counters of the navigation filter; -1 not yet seen
-        "vertical_resets",
+        "code_seen",  # s, validity of the newest marker measurement that was evidence
         *(f"pose_{i}_{entry}" for i in range(POSES) for entry in range(_POSE)),
     ),
 )
@@ -92,7 +104,7 @@ TARGET_HYPOTHESES = Layout(
         for i in range(HYPOTHESES)
         for name in (
             "probability",  # 0..1, that this is the pad; 0 no hypothesis
-            "p_WP_x",  # m, in the navigation frame
+            "p_WP_x",  # m, in the navigation filter's frame
             "p_WP_y",
             "p_WP_z",
             "evidence",  # 1, log of its odds
@@ -109,7 +121,8 @@ _RANGE_NOISE, _GROUND_NOISE, _PAD_RADIUS = _i("range_noise"), _i("ground_noise")
 _RADIUS, _SPEED = _i("initial_radius"), _i("initial_speed")
 _GATE_2, _GATE_3 = _i("gate_2"), _i("gate_3")
 _LATE, _MARKER_ODDS, _ODDS_LIMIT = _i("late_odds"), _i("marker_odds"), _i("marker_odds_limit")
-_CONFIRM, _LOST, _FORGET = _i("confirmations"), _i("lost_time"), _i("forget_time")
+_MARKER_TIME, _DRIFT_SPEED = _i("marker_time"), _i("drift_speed")
+_KNOWN, _FORGET_RADIUS, _FORGET = _i("known_radius"), _i("forget_radius"), _i("forget_time")
 _ARM = _i("range_finder_x")
 
 (
@@ -118,14 +131,12 @@ _ARM = _i("range_finder_x")
     _RANGE_ARRIVAL,
     _POLLS,
     _RANGE_POLLS,
-    _H_RESETS,
-    _V_RESETS,
+    _CODE_SEEN,
     _RING,
-) = range(8)
+) = range(7)
 _RANGE_EVERY = 4  # polls, so that ranges do not crowd the slots
 _MERGE_DISTANCE = 0.25  # m, hypotheses closer than this are the same pad
-_NEWBORN = 5  # measurements, with fewer a hypothesis may be replaced
-_NEWBORN_TIME = 0.3  # s, after this without one
+_AHEAD = 1.0  # s, in which the vehicle answers: so long the place must stay known
 _UNSEEN = 0.25  # s, after which a marker seen elsewhere counts against a hypothesis
 _FURTHEST_RAY = 0.2  # 1, least slope of a ray that says where a lamp is
 _EDGE = 0.42  # 1, tangent; a lamp this far from the middle may be cut off by the image's edge
@@ -138,10 +149,6 @@ _E_P = VEHICLE_ESTIMATE.index("p_WB_x")
 _E_V = VEHICLE_ESTIMATE.index("v_WB_x")
 _E_HEIGHT = VEHICLE_ESTIMATE.index("height_above_ground")
 _E_HEIGHT_VALID = VEHICLE_ESTIMATE.index("height_above_ground_valid")
-_E_H_COUNTER = VEHICLE_ESTIMATE.index("horizontal_reset_counter")
-_E_H_RESET = VEHICLE_ESTIMATE.index("horizontal_reset_x")
-_E_V_COUNTER = VEHICLE_ESTIMATE.index("vertical_reset_counter")
-_E_V_RESET = VEHICLE_ESTIMATE.index("vertical_reset")
 _RANGE = RANGE_FINDER.index("range")
 _COUNT_BLOBS = INFRARED.index("count")
 _BLOB = INFRARED.index("blob_0_x")
@@ -158,28 +165,21 @@ _T_SOURCE = TARGET_ESTIMATE.index("source")
 
 
 @njit(cache=True)
-def _remember_pose(memory, tracks, estimate):
-    """Append the vehicle's pose; a reset of the navigation filter moves everything kept."""
-    jump = np.zeros(3)
-    if memory[_H_RESETS] >= 0.0 and estimate[_E_H_COUNTER] != memory[_H_RESETS]:
-        jump[0], jump[1] = estimate[_E_H_RESET], estimate[_E_H_RESET + 1]
-    if memory[_V_RESETS] >= 0.0 and estimate[_E_V_COUNTER] != memory[_V_RESETS]:
-        jump[2] = estimate[_E_V_RESET]
-    memory[_H_RESETS], memory[_V_RESETS] = estimate[_E_H_COUNTER], estimate[_E_V_COUNTER]
+def _remember_pose(memory, estimate):
+    """Append the vehicle's pose, its place by odometry: the integral of the estimated velocity."""
     polls = int(memory[_POLLS])
-    if jump[0] != 0.0 or jump[1] != 0.0 or jump[2] != 0.0:
-        for i in range(tracks.shape[0]):
-            if tracks[i, BORN] >= 0.0:
-                track_filter.shift(tracks[i], jump)
-        for k in range(max(polls - POSES, 0), polls):
-            start = _RING + _POSE * (k % POSES)
-            for i in range(3):
-                memory[start + 1 + i] += jump[i]
     start = _RING + _POSE * (polls % POSES)
+    before = _RING + _POSE * ((polls - 1) % POSES)
+    for i in range(3):
+        v = estimate[_E_V + i]
+        if polls == 0:
+            memory[start + 1 + i] = estimate[_E_P + i]
+        else:
+            way = 0.5 * (memory[before + 8 + i] + v) * (estimate[_E_T] - memory[before])
+            memory[start + 1 + i] = memory[before + 1 + i] + way
+        memory[start + 8 + i] = v
     memory[start] = estimate[_E_T]
-    memory[start + 1 : start + 4] = estimate[_E_P : _E_P + 3]
     memory[start + 4 : start + 8] = estimate[_E_Q : _E_Q + 4]
-    memory[start + 8 : start + 11] = estimate[_E_V : _E_V + 3]
     memory[_POLLS] = polls + 1.0
 
 
@@ -218,7 +218,7 @@ def _pose_at(memory, time, p, q):
 
 
 @njit(cache=True)
-def observe_marker(observation, time, marker, p_WB, q_WB, X_BC, parameters):
+def observe_marker(observation, time, marker, p_OB, q_WB, X_BC, parameters):
     """Write a marker measurement: all of p, and the bearing's bias at its height.
 
     Returns p_BP_W and its covariance, shape (9,).
@@ -234,7 +234,7 @@ def observe_marker(observation, time, marker, p_WB, q_WB, X_BC, parameters):
     values = np.empty(3)
     for i in range(3):
         H[i, i] = 1.0
-        values[i] = p_WB[i] + found[i]
+        values[i] = p_OB[i] + found[i]
     H[0, 3] = H[1, 4] = height
     R = np.array(
         [
@@ -248,10 +248,10 @@ def observe_marker(observation, time, marker, p_WB, q_WB, X_BC, parameters):
 
 
 @njit(cache=True)
-def observe_blob(observation, time, x, y, height, p_WB, q_WB, X_BC, parameters):
+def observe_blob(observation, time, x, y, height, p_OB, q_WB, X_BC, parameters):
     """Write the direction of one blob, a lamp `height` (m) below the body: two rows.
 
-        0 = (p − p_WC)_i − d_i/d_z (p − p_WC)_z + height b_i,   i = x, y,   d = R_WC (x, y, 1)
+        0 = (p − p_OC)_i − d_i/d_z (p − p_OC)_z + height b_i,   i = x, y,   d = R_WC (x, y, 1)
 
     Returns p_BP_W of the lamp at that height and its covariance, shape (9,); NaN if the ray
     is too flat.
@@ -275,7 +275,7 @@ def observe_blob(observation, time, x, y, height, p_WB, q_WB, X_BC, parameters):
         H[i, i] = 1.0
         H[i, 2] = -slope
         H[i, 3 + i] = height
-        values[i] = p_WB[i] + arm[i] - slope * (p_WB[2] + arm[2])
+        values[i] = p_OB[i] + arm[i] - slope * (p_OB[2] + arm[2])
         J[i, 0] = s * (R_WC[i, 0] - slope * R_WC[2, 0])
         J[i, 1] = s * (R_WC[i, 1] - slope * R_WC[2, 1])
     angle = parameters[_ANGLE] ** 2
@@ -293,7 +293,7 @@ def observe_blob(observation, time, x, y, height, p_WB, q_WB, X_BC, parameters):
 
 
 @njit(cache=True)
-def observe_range(observation, time, ranging, p_WB, q_WB, off_pad, parameters):
+def observe_range(observation, time, ranging, p_OB, q_WB, off_pad, parameters):
     """Write a range: p_z, where the beam meets the pad or the ground around it."""
     R_WB = rotation_matrix(q_WB)
     arm = R_WB[2, 0] * parameters[_ARM] + R_WB[2, 1] * parameters[_ARM + 1]
@@ -304,22 +304,29 @@ def observe_range(observation, time, ranging, p_WB, q_WB, off_pad, parameters):
     H = np.zeros((3, 5))
     H[0, 2] = 1.0
     values = np.zeros(3)
-    values[0] = p_WB[2] - height
+    values[0] = p_OB[2] - height
     R = np.zeros((3, 3))
     R[0, 0] = noise
     track_filter.whiten(observation, time, H, values, R, 1)
 
 
 @njit(cache=True)
-def _squared_innovation(track, observation, x, P, noise):
+def _noise(track, parameters):
+    """The process noise of a track, of a pad at rest or of one that moves."""
+    start = NOISE if track[MOVES] > 0.0 else 0
+    return parameters[start : start + NOISE]
+
+
+@njit(cache=True)
+def _squared_innovation(track, observation, x, P, parameters):
     """Normalised innovation squared and log-determinant of a measurement at its own time."""
-    if not track_filter.prior(track, observation[TIME], x, P, noise):
+    if not track_filter.prior(track, observation, x, P, _noise(track, parameters)):
         return math.inf, 0.0
     return track_filter.fuse(x, P, observation)
 
 
 @njit(cache=True)
-def _associate(tracks, observation, gate, taken, x, P, noise):
+def _likeliest(tracks, observation, gate, taken, x, P, parameters):
     """The likeliest track (in use, not yet `taken`) of a measurement, and its NIS; -1 if none.
 
     Likeliest, not nearest: a track that has just begun is so uncertain that it is near everything.
@@ -328,81 +335,148 @@ def _associate(tracks, observation, gate, taken, x, P, noise):
     for i in range(tracks.shape[0]):
         if tracks[i, BORN] < 0.0 or taken[i]:
             continue
-        squared, spread = _squared_innovation(tracks[i], observation, x, P, noise)
+        squared, spread = _squared_innovation(tracks[i], observation, x, P, parameters)
         if squared <= gate and squared + spread < least:
             best, best_squared, least = i, squared, squared + spread
     return best, best_squared
 
 
 @njit(cache=True)
-def _free_track(tracks):
-    """A track that is not in use; -1 if there is none."""
+def _associate(tracks, observation, gate, taken, named, x, P, parameters):
+    """The track of a measurement and its NIS; -1 if it belongs to none.
+
+    What no track has foreseen may be a pad that has set off or stopped since it was last seen. A
+    measurement whose code does not name the pad must be so near that it can be nothing else.
+    """
+    best, best_squared = _likeliest(tracks, observation, gate, taken, x, P, parameters)
+    if best >= 0:
+        return best, best_squared
+    best_since = math.inf
     for i in range(tracks.shape[0]):
-        if tracks[i, BORN] < 0.0:
-            return i
-    return -1
+        since = observation[TIME] - tracks[i, FUSED]
+        if tracks[i, BORN] < 0.0 or taken[i] or since <= 0.0 or since >= best_since:
+            continue
+        if not named and since * parameters[_SPEED] > _MERGE_DISTANCE:
+            continue
+        observation[KICK], observation[SINCE] = parameters[_SPEED] ** 2, since
+        squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
+        if squared <= gate:
+            best, best_squared, best_since = i, squared, since
+    observation[KICK] = 0.0 if best < 0 else parameters[_SPEED] ** 2
+    observation[SINCE] = 0.0 if best < 0 else best_since
+    return best, best_squared
 
 
 @njit(cache=True)
-def _begin(tracks, time, found, p_WB, height_sigma, parameters, noise, x, P):
+def _known(track, t, x, P, parameters):
+    """Whether the place of a track is known for a while; x and P are its estimate at t (s)."""
+    track_filter.newest(track, t, x, P, _noise(track, parameters))
+    ahead = 0.0
+    for i in range(2):
+        spread = P[i, i] + _AHEAD * (2.0 * P[i, 3 + i] + _AHEAD * P[3 + i, 3 + i])
+        ahead = max(ahead, spread)
+    return ahead <= parameters[_KNOWN] ** 2
+
+
+@njit(cache=True)
+def _room(tracks, t, x, P, parameters):
+    """A track that is not in use or else the least probable that is not known; -1 if all are."""
+    least = -1
+    for i in range(tracks.shape[0]):
+        if tracks[i, BORN] < 0.0:
+            return i
+        if tracks[i, SEEN] == t or _known(tracks[i], t, x, P, parameters):
+            continue
+        if least < 0 or _evidence(tracks[i]) < _evidence(tracks[least]):
+            least = i
+    return least
+
+
+@njit(cache=True)
+def _begin(tracks, t, time, found, p_OB, height_sigma, parameters, x, P):
     """Begin a hypothesis around a measured p_BP_W; returns its number, -1 if there is no room."""
-    i = _free_track(tracks)
+    i = _room(tracks, t, x, P, parameters)
     if i < 0:
         return -1
-    others = False
+    late = False
     for j in range(tracks.shape[0]):
-        others |= j != i and tracks[j, BORN] >= 0.0 and tracks[j, COUNT] >= _NEWBORN
+        late |= j != i and tracks[j, BORN] >= 0.0 and _known(tracks[j], t, x, P, parameters)
     P[:] = 0.0
     x[:] = 0.0
     for k in range(3):
-        x[k] = p_WB[k] + found[k]
+        x[k] = p_OB[k] + found[k]
         P[k, k] = parameters[_RADIUS] ** 2
         P[3 + k, 3 + k] = parameters[_SPEED] ** 2
     P[2, 2] = height_sigma * height_sigma
-    P[6, 6] = P[7, 7] = noise[BIAS_SIGMA] ** 2
+    P[6, 6] = P[7, 7] = parameters[BIAS_SIGMA] ** 2
     track_filter.begin(tracks[i], time, x, P)
-    tracks[i, PRIOR] = parameters[_LATE] if others else 0.0
+    tracks[i, PRIOR] = parameters[_LATE] if late else 0.0
     return i
 
 
 @njit(cache=True)
-def _take(track, observation, t, x, P, noise):
-    """Fuse a camera's measurement into a track at time t."""
+def _take(track, observation, t, x, P, parameters):
+    """Fuse a camera's measurement into a track at time t; see whether it moves.
+
+    It does if its velocity is not explained by the odometry's, drift_speed.
+    """
+    noise = _noise(track, parameters)
     track_filter.insert(track, observation, x, P, noise)
     track[FUSED] = max(track[FUSED], observation[TIME])
     track[SEEN] = t
     track[COUNT] += 1.0
+    track_filter.newest(track, t, x, P, noise)
+    drift = parameters[_DRIFT_SPEED] ** 2
+    speed = x[3] * x[3] / (P[3, 3] + drift) + x[4] * x[4] / (P[4, 4] + drift)
+    track[MOVES] = 1.0 if speed > parameters[_GATE_2] else 0.0
 
 
 @njit(cache=True)
-def _evidence(track, parameters):
+def _evidence(track):
     """The log of the odds of a hypothesis."""
-    return track[PRIOR] + parameters[_MARKER_ODDS] * track[MARKERS]
+    return track[PRIOR] + track[CODE]
 
 
 @njit(cache=True)
-def _credit(tracks, i, time, parameters):
-    """The marker was seen on track i, so not on those that nothing is seen of."""
-    most = parameters[_ODDS_LIMIT] / parameters[_MARKER_ODDS]
-    tracks[i, MARKERS] = min(tracks[i, MARKERS] + 1.0, most)
+def _credit(tracks, i, time, memory, parameters):
+    """The marker was seen on track i, so not on those that nothing is seen of.
+
+    Frames that follow each other closely tell the same: 1 − exp(−Δt/marker_time) of the odds.
+    """
+    interval = time - memory[_CODE_SEEN]
+    if interval <= 0.0:
+        return
+    memory[_CODE_SEEN] = time
+    odds = -parameters[_MARKER_ODDS] * math.expm1(-interval / parameters[_MARKER_TIME])
+    tracks[i, CODE] = min(tracks[i, CODE] + odds, parameters[_ODDS_LIMIT])
     for j in range(tracks.shape[0]):
         if j != i and time - tracks[j, FUSED] > _UNSEEN:
-            tracks[j, MARKERS] = max(tracks[j, MARKERS] - 1.0, 0.0)
+            tracks[j, CODE] = max(tracks[j, CODE] - odds, 0.0)
 
 
 @njit(cache=True)
-def _probabilities(tracks, parameters, probability):
-    """Write each track's probability, the odds normalised; the most probable one or -1."""
-    best = -1
-    highest = -math.inf
-    for i in range(tracks.shape[0]):
-        if tracks[i, BORN] >= 0.0 and _evidence(tracks[i], parameters) > highest:
-            best, highest = i, _evidence(tracks[i], parameters)
-    total = 0.0
+def _probabilities(tracks, t, x, P, parameters, probability):
+    """Write each track's probability, the odds normalised; the most probable one or -1.
+
+    A track that is not known yet, a reflection perhaps, counts only while no other is.
+    """
+    best, known = -1, False
     for i in range(tracks.shape[0]):
         probability[i] = 0.0
-        if tracks[i, BORN] >= 0.0:
-            probability[i] = math.exp(_evidence(tracks[i], parameters) - highest)
+        if tracks[i, BORN] < 0.0:
+            continue
+        own = _known(tracks[i], t, x, P, parameters)
+        if own and not known:
+            probability[:i] = 0.0
+            best, known = -1, True
+        if own == known:
+            probability[i] = 1.0
+            if best < 0 or _evidence(tracks[i]) > _evidence(tracks[best]):
+                best = i
+    total = 0.0
+    for i in range(tracks.shape[0]):
+        if probability[i] > 0.0:
+            probability[i] = math.exp(_evidence(tracks[i]) - _evidence(tracks[best]))
             total += probability[i]
     for i in range(tracks.shape[0]):
         if total > 0.0:
@@ -452,9 +526,8 @@ def poll(
     X_BI, X_BM : arrays of shape (3, 4)
         Mounts of the infrared and of the marker camera.
     """
-    noise = parameters[:NOISE]
     if estimate[_E_ATTITUDE_VALID] > 0.0 and estimate[_E_H_VALID] > 0.0:
-        _remember_pose(memory, tracks, estimate)
+        _remember_pose(memory, estimate)
     if memory[_POLLS] == 0.0:
         return
     x = np.empty(STATES)
@@ -463,7 +536,7 @@ def poll(
     observation = np.zeros(OBSERVATION)
     taken = np.zeros(tracks.shape[0], np.bool_)
     probability = np.empty(tracks.shape[0])
-    leader = _probabilities(tracks, parameters, probability)
+    leader = _probabilities(tracks, t, x, P, parameters, probability)
     sources = int(parameters[_SOURCES])
 
     if (
@@ -476,14 +549,14 @@ def poll(
         if _pose_at(memory, validity, p, q):
             found = observe_marker(observation, validity, marker, p, q, X_BM, parameters)
             gate = parameters[_GATE_3]
-            i, squared = _associate(tracks, observation, gate, taken, x, P, noise)
+            i, squared = _associate(tracks, observation, gate, taken, True, x, P, parameters)
             if i < 0:
                 sigma = parameters[_RADIUS]
-                i = _begin(tracks, validity, found, p, sigma, parameters, noise, x, P)
+                i = _begin(tracks, t, validity, found, p, sigma, parameters, x, P)
                 squared = 0.0
             if i >= 0:
-                _take(tracks[i], observation, t, x, P, noise)
-                _credit(tracks, i, validity, parameters)
+                _take(tracks[i], observation, t, x, P, parameters)
+                _credit(tracks, i, validity, memory, parameters)
             if i == leader or leader < 0:
                 target[_T_RATIO] = squared / gate
                 target[_T_REJECTED] = 0.0
@@ -505,7 +578,9 @@ def poll(
                 bx, by = infrared[_BLOB + 3 * blob], infrared[_BLOB + 3 * blob + 1]
                 height, height_sigma = math.nan, parameters[_GROUND_NOISE]
                 if leader >= 0:
-                    track_filter.prior(tracks[leader], validity, x, P, noise)
+                    observation[TIME], observation[KICK] = validity, 0.0
+                    noise = _noise(tracks[leader], parameters)
+                    track_filter.prior(tracks[leader], observation, x, P, noise)
                     height = p[2] - x[2]
                     height_sigma = max(height_sigma, math.sqrt(P[2, 2]))
                 elif estimate[_E_HEIGHT_VALID] > 0.0:
@@ -518,14 +593,14 @@ def poll(
                 if not math.isfinite(found[0]):
                     continue
                 gate = parameters[_GATE_2]
-                i, squared = _associate(tracks, observation, gate, taken, x, P, noise)
+                i, squared = _associate(tracks, observation, gate, taken, False, x, P, parameters)
                 if i < 0:
-                    i = _begin(tracks, validity, found, p, height_sigma, parameters, noise, x, P)
+                    i = _begin(tracks, t, validity, found, p, height_sigma, parameters, x, P)
                     squared = 0.0
                 if i < 0:
                     continue
                 taken[i] = True
-                _take(tracks[i], observation, t, x, P, noise)
+                _take(tracks[i], observation, t, x, P, parameters)
                 if i == leader or leader < 0:
                     fused = True
                     target[_T_RATIO] = squared / gate
@@ -545,87 +620,82 @@ def poll(
         for i in range(tracks.shape[0]):
             if tracks[i, BORN] < 0.0:
                 continue
-            track_filter.prior(tracks[i], ranging[TIME_OF_VALIDITY], x, P, noise)
+            observation[TIME], observation[KICK] = ranging[TIME_OF_VALIDITY], 0.0
+            noise = _noise(tracks[i], parameters)
+            track_filter.prior(tracks[i], observation, x, P, noise)
             R_WB = rotation_matrix(q)
             reach = ranging[_RANGE]
             off = math.hypot(p[0] - reach * R_WB[0, 2] - x[0], p[1] - reach * R_WB[1, 2] - x[1])
             off_pad = off > parameters[_PAD_RADIUS]
             validity = ranging[TIME_OF_VALIDITY]
             observe_range(observation, validity, ranging, p, q, off_pad, parameters)
-            squared, _ = _squared_innovation(tracks[i], observation, x, P, noise)
+            squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
             if squared <= parameters[_GATE_2]:
                 # A range is no sighting: it does not count.
                 track_filter.insert(tracks[i], observation, x, P, noise)
 
-    _tidy(tracks, t, parameters, noise, x, P)
-    _write_target(target, hypotheses, tracks, t, estimate, parameters, noise, x, P, probability)
-    if t - measurement[TIME_OF_ARRIVAL] > parameters[_LOST]:
+    _tidy(tracks, t, x, P, parameters)
+    _write_target(target, hypotheses, tracks, t, memory, estimate, x, P, parameters, probability)
+    if target[_ACQUIRED] == 0.0:
         measurement[VALID] = 0.0
 
 
 @njit(cache=True)
-def _tidy(tracks, t, parameters, noise, x, P):
-    """Forget hypotheses that are not seen any more beside one that is, and merge equal ones."""
+def _tidy(tracks, t, x, P, parameters):
+    """Forget hypotheses that say nothing any more or are long out of sight; merge equal ones."""
     count = tracks.shape[0]
-    seen = False
     for i in range(count):
-        seen |= tracks[i, BORN] >= 0.0 and t - tracks[i, SEEN] <= parameters[_LOST]
-    for i in range(count):
-        unseen = t - tracks[i, SEEN]
-        vain = tracks[i, COUNT] < _NEWBORN and unseen > _NEWBORN_TIME
-        if tracks[i, BORN] >= 0.0 and (vain or (seen and unseen > parameters[_FORGET])):
+        if tracks[i, BORN] < 0.0:
+            continue
+        known = _known(tracks[i], t, x, P, parameters)
+        if max(P[0, 0], P[1, 1]) > parameters[_FORGET_RADIUS] ** 2:
             tracks[i, BORN] = -1.0
-    for i in range(count):
-        for j in range(i):
-            if tracks[i, BORN] < 0.0 or tracks[j, BORN] < 0.0:
+            continue
+        ix, iy = x[0], x[1]
+        for j in range(count):
+            if j == i or tracks[j, BORN] < 0.0 or not _known(tracks[j], t, x, P, parameters):
                 continue
-            if min(tracks[i, COUNT], tracks[j, COUNT]) < _NEWBORN:
-                continue
-            track_filter.newest(tracks[i], t, x, P, noise)
-            ax, ay = x[0], x[1]
-            track_filter.newest(tracks[j], t, x, P, noise)
-            if math.hypot(ax - x[0], ay - x[1]) < _MERGE_DISTANCE:
-                weaker = _evidence(tracks[i], parameters) <= _evidence(tracks[j], parameters)
-                loser = i if weaker else j
-                tracks[loser, BORN] = -1.0
+            if tracks[j, SEEN] - tracks[i, SEEN] > parameters[_FORGET]:
+                tracks[i, BORN] = -1.0
+                break
+            near = math.hypot(ix - x[0], iy - x[1]) < _MERGE_DISTANCE
+            if known and near and _evidence(tracks[i]) <= _evidence(tracks[j]):
+                tracks[i, BORN] = -1.0
+                break
 
 
 @njit(cache=True)
-def _write_target(target, hypotheses, tracks, t, estimate, parameters, noise, x, P, probability):
-    leader = _probabilities(tracks, parameters, probability)
+def _write_target(target, hypotheses, tracks, t, memory, estimate, x, P, parameters, probability):
+    leader = _probabilities(tracks, t, x, P, parameters, probability)
     target[_VALIDITY] = t
+    target[_ACQUIRED] = 0.0
     hypotheses[:] = 0.0
     if leader < 0:
-        target[_ACQUIRED] = 0.0
         return
-    since = t - estimate[_E_T]
-    track_filter.newest(tracks[leader], t, x, P, noise)
+    now = _RING + _POSE * (int(memory[_POLLS] - 1.0) % POSES)
+    since = t - memory[now]
+    target[_ACQUIRED] = 1.0 if _known(tracks[leader], t, x, P, parameters) else 0.0
     own = x[:3].copy()
     for i in range(3):
-        v = estimate[_E_V + i]
-        target[_T_P + i] = x[i] - estimate[_E_P + i] - since * v
+        v = memory[now + 8 + i]
+        target[_T_P + i] = x[i] - memory[now + 1 + i] - since * v
         target[_T_V + i] = x[3 + i] - v
         target[_T_V_PAD + i] = x[3 + i]
         target[_T_P_VARIANCE + i] = P[i, i]
         target[_T_V_VARIANCE + i] = P[3 + i, 3 + i]
+    target[_T_FUSED] = tracks[leader, FUSED]
     for j in range(tracks.shape[0]):
         if tracks[j, BORN] < 0.0:
             continue
-        start = 0
-        if j != leader:
-            rank = 1
-            for k in range(tracks.shape[0]):
-                tie = probability[k] == probability[j] and k < j
-                rank += k not in (j, leader) and (probability[k] > probability[j] or tie)
-            start = rank * _PER_HYPOTHESIS
-            track_filter.newest(tracks[j], t, x, P, noise)
-            for i in range(3):
-                target[_T_P_VARIANCE + i] += probability[j] * (x[i] - own[i]) ** 2
+        rank = 0
+        for k in range(tracks.shape[0]):
+            tie = probability[k] == probability[j] and k < j
+            rank += k not in (j, leader) and (probability[k] > probability[j] or tie)
+        start = 0 if j == leader else (rank + 1) * _PER_HYPOTHESIS
+        track_filter.newest(tracks[j], t, x, P, _noise(tracks[j], parameters))
         hypotheses[start] = probability[j]
-        hypotheses[start + 1 : start + 4] = own if j == leader else x[:3]
-        hypotheses[start + 4] = _evidence(tracks[j], parameters)
+        for i in range(3):
+            target[_T_P_VARIANCE + i] += probability[j] * (x[i] - own[i]) ** 2
+            hypotheses[start + 1 + i] = x[i] - memory[now + 1 + i] + estimate[_E_P + i]
+        hypotheses[start + 4] = _evidence(tracks[j])
         hypotheses[start + 5] = tracks[j, COUNT]
-    target[_T_FUSED] = tracks[leader, FUSED]
-    fresh = t - tracks[leader, FUSED] <= parameters[_LOST]
-    confirmed = tracks[leader, COUNT] >= parameters[_CONFIRM]
-    target[_ACQUIRED] = 1.0 if fresh and confirmed else 0.0

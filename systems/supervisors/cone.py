@@ -5,10 +5,11 @@ known and close enough,
 
     |e| + k σ ≤ ρ(h) = cone_radius + cone_slope h,
 
-e being the horizontal error and σ the target's standard deviation: inside it descends,
-outside it waits, far outside it climbs. Close to the pad it waits for a moment at which
+e being the horizontal error and σ the target's standard deviation, which grows while the pad is
+not seen: inside it descends, outside it waits, far outside it climbs. Close to the pad it
+waits for a moment at which
 
-    |e + v τ| ≤ r,   r growing from touch_radius to touch_radius_limit while it waits,
+    |e + v τ| + σ ≤ r,   r growing from touch_radius to touch_radius_limit while it waits,
 
 v the velocity relative to the pad, and then sits down at `touch_speed`.
 
@@ -28,11 +29,15 @@ not small before: wind and ground make the rotors lift more. A pad that rises so
 from below is noticed because the vehicle does not sink any more.) The rotors stop at once, because
 a vehicle that is light on its legs slides.
 
-A pad that moves is followed with its velocity, vertically too. When the target is lost the
-vehicle holds, goes round (climbs over the last known place, which counts an attempt),
-and searches along a spiral whose windings lie within the cameras' view. When attempts or time
-are used up it lands on the best it knows. Sensors are not switched by height: their
-covariances say which one counts.
+A pad that moves is followed with its velocity, vertically too. What is not seen is carried on by
+the estimator, so nothing is lost by the clock, but by k σ > ρ(h)/2. Then what another attempt can
+show decides. If this one has seen the pad on its way down, the vehicle holds for a while, goes
+round (climbs over the place, which counts an attempt) and comes again. Otherwise, and in the last
+attempt, every second makes it worse: it lands where the pad should be, at full speed, unless it
+sees it on the way, as with sensors that do not reach far. A pad that was never seen, or
+is known no more, is looked for from further down and then along a spiral whose windings lie
+within the cameras' view. When time is up it lands on the best it knows. Sensors are not
+switched by height: their covariances say which one counts.
 """
 
 import math
@@ -53,6 +58,10 @@ from systems.supervisors.state_machine import (
 _GRAVITY = 9.80665  # m/s2
 _NEAR, _FAR = 0.5, 1.0  # m, of error: the position loop is stiffened within, not beyond
 _VERTICAL_GAIN = 1.0  # 1/s, height error to speed
+_LOW_GAIN = 2.0  # 1/s, the same just above the pad
+_CREEP = 0.05  # m/s, at the end of the descent in the cone
+_SLOW = 0.3  # m, of the feet above the pad, below which the vehicle does not brake any more
+_SLIP = 0.03  # s, of the pad's way: 6 cm of one at 2 m/s
 _CLOSE = 0.12  # m, of the feet above the pad, within which a push from below is the ground
 _AT_PAD = 0.06  # m, of the feet above the pad, at which one foot of a tilted vehicle may stand
 _ORDERED = 0.2  # m/s, rate of descent from which on not to sink means something
@@ -70,7 +79,7 @@ class ConeMemory(Memory):
     thrust: float = math.nan  # 1, rotor command by that of level flight, behind the rotors' lag
     still_since: float = NOT_YET  # s, at the pad it has not sunk since, though it should
     known: float = 0.0  # 0/1, the pad has been seen
-    pad_x: float = math.nan  # m, the pad as last known, carried on with its velocity
+    pad_x: float = math.nan  # m, the pad as last known
     pad_y: float = math.nan
     pad_z: float = math.nan
     pad_ux: float = 0.0  # m/s
@@ -79,7 +88,8 @@ class ConeMemory(Memory):
     turn: float = 0.0  # rad, along the spiral
     centre_x: float = 0.0  # m, of the spiral
     centre_y: float = 0.0
-    level_z: float = 0.0  # m, to climb to
+    level_z: float = 0.0  # m, from which the attempt starts
+    attempt_began: float = 0.0  # s
 
 
 S = Situation[ConeMemory]
@@ -93,12 +103,13 @@ class Cone:
     table = TransitionTable(
         initial="look",
         states=(
-            State("look", entry=("hold_position",), stay=_WATCH),
+            State("look", entry=("hold_position", "note_start"), stay=_WATCH),
             State("descend", stay=(*_WATCH, "follow", "descend_in_cone")),
             State("settle", stay=(*_WATCH, "follow", "keep_low")),
             State("touch", stay=(*_WATCH, "follow", "sit_down")),
             State("hold", stay=(*_WATCH, "follow", "rise_for_view")),
             State("go_round", entry=("begin_attempt",), stay=(*_WATCH, "follow", "climb")),
+            State("look_lower", stay=(*_WATCH, "sink_to_look")),
             State("search", entry=("begin_search",), stay=(*_WATCH, "fly_spiral")),
             State("land_anyway", stay=(*_WATCH, "follow_or_return", "sit_down_there")),
         ),
@@ -109,25 +120,30 @@ class Cone:
                 ("descend", "settle", "touch", "land_anyway"), "landed", "touched_down"
             ),
             *transitions_from(
-                ("look", "descend", "settle", "hold", "go_round", "search"),
+                ("look", "look_lower", "descend", "settle", "hold", "go_round", "search"),
                 "land_anyway",
                 "time_is_up",
             ),
-            Transition("look", "descend", "target_acquired"),
-            Transition("look", "search", "looked_in_vain"),
-            Transition("descend", "hold", "target_lost"),
+            Transition("look", "descend", "certain"),
+            Transition("look", "look_lower", "looked_in_vain"),
+            Transition("look_lower", "descend", "certain"),
+            Transition("look_lower", "search", "low_enough_to_look"),
+            Transition("descend", "land_anyway", "uncertain_for_good"),
+            Transition("descend", "hold", "uncertain"),
             Transition("descend", "settle", "close_above_pad"),
-            Transition("settle", "hold", "target_lost"),
+            Transition("settle", "touch", "blind_for_good"),
+            Transition("settle", "hold", "uncertain"),
             Transition("settle", "touch", "aligned"),
             Transition("settle", "descend", "blown_away"),
             Transition("touch", "descend", "missing_pad"),
-            Transition("hold", "descend", "target_acquired"),
-            Transition("hold", "go_round", "held_and_attempts_left"),
-            Transition("hold", "land_anyway", "held_long_enough"),
-            Transition("go_round", "descend", "high_enough_and_acquired"),
+            Transition("hold", "descend", "seen_again"),
+            Transition("hold", "go_round", "held_long_enough"),
+            Transition("go_round", "descend", "high_enough_and_seen"),
+            Transition("go_round", "land_anyway", "high_enough_and_known"),
             Transition("go_round", "search", "high_enough"),
-            Transition("search", "descend", "target_acquired"),
+            Transition("search", "descend", "seen_again"),
             Transition("search", "land_anyway", "searched_everywhere"),
+            Transition("land_anyway", "descend", "seen_in_time"),
         ),
     )
     memory = ConeMemory
@@ -145,10 +161,14 @@ class Cone:
     def _goal(self, s: S) -> tuple[float, float]:
         """Where the body must be so that it stands over the pad after it has come down level.
 
-        It leans into the wind by −d̂/g, and will fall back on its feet.
+        It leans into the wind by −d̂/g, and will fall back on its feet; under them a pad that moves
+        slips away until the rotors have stopped.
         """
         m, share = s.memory, self.config.feet_height / _GRAVITY
-        return m.pad_x + share * m.drift_ax, m.pad_y + share * m.drift_ay
+        return (
+            m.pad_x + share * m.drift_ax + _SLIP * m.pad_ux,
+            m.pad_y + share * m.drift_ay + _SLIP * m.pad_uy,
+        )
 
     def _error(self, s: S) -> tuple[float, float]:
         x, y = self._goal(s)
@@ -172,21 +192,52 @@ class Cone:
 
     # -- guards
 
-    def target_acquired(self, s: S) -> bool:
-        """The target is acquired."""
-        return s.acquired
+    def certain(self, s: S) -> bool:
+        """The place of the pad is known so well that it does not hinder the descent."""
+        return s.acquired and self.config.sigmas * s.goal_sigma <= 0.5 * self._radius(s)
 
-    def target_lost(self, s: S) -> bool:
-        """The target is not acquired any more."""
-        return not s.acquired
+    def uncertain(self, s: S) -> bool:
+        """The pad has not been seen for so long that its place is too uncertain for this height."""
+        return not self.certain(s)
+
+    def uncertain_for_good(self, s: S) -> bool:
+        """That, and another attempt would not see more."""
+        return self.uncertain(s) and not self._sees_more_from_above(s)
+
+    def blind_for_good(self, s: S) -> bool:
+        """Waiting makes it worse: the pad is not seen, and another attempt would not see more."""
+        return s.goal_sigma > self.config.touch_radius and not self._sees_more_from_above(s)
+
+    def _sees_more_from_above(self, s: S) -> bool:
+        """Whether this attempt, not the last one, has seen the pad on its way down."""
+        m, c = s.memory, self.config
+        sunk = m.last_fusion > m.attempt_began and m.sighting_z < m.level_z - c.tolerance
+        return sunk and m.attempts < c.maximum_attempts
+
+    def seen_again(self, s: S) -> bool:
+        """The pad has been seen in this state, and its place is certain enough."""
+        return s.memory.last_fusion > s.memory.entered and self.certain(s)
+
+    def seen_in_time(self, s: S) -> bool:
+        """That, high enough to make use of it and before time is up."""
+        return (
+            self.seen_again(s)
+            and self._feet(s) > self.config.settle_height
+            and not self.time_is_up(s)
+        )
 
     def looked_in_vain(self, s: S) -> bool:
         """The target is not seen from here."""
         return s.time - s.memory.entered >= self.config.look_time
 
+    def low_enough_to_look(self, s: S) -> bool:
+        """What sees the pad from close by alone would have seen it."""
+        return s.height + self.config.feet_height <= self.config.look_height
+
     def close_above_pad(self, s: S) -> bool:
         """The feet are so low that only sitting down is left."""
-        return self._feet(s) <= self.config.settle_height + 0.05
+        low = self._feet(s) <= self.config.settle_height + 0.05
+        return low and self._spread(s) <= self._radius(s)
 
     def aligned(self, s: S) -> bool:
         """The pad will be met where it should be."""
@@ -235,17 +286,17 @@ class Cone:
         """The target has not come back."""
         return s.time - s.memory.entered >= self.config.hold_time
 
-    def held_and_attempts_left(self, s: S) -> bool:
-        """The target has not come back, and another attempt is left."""
-        return self.held_long_enough(s) and s.memory.attempts < self.config.maximum_attempts
-
     def high_enough(self, s: S) -> bool:
         """The height to start again from is reached."""
         return s.z >= s.memory.level_z - self.config.tolerance
 
-    def high_enough_and_acquired(self, s: S) -> bool:
-        """The height to start again from is reached, and the target is seen."""
-        return s.acquired and self.high_enough(s)
+    def high_enough_and_seen(self, s: S) -> bool:
+        """The height to start again from is reached, and the pad is seen from there."""
+        return self.high_enough(s) and self.seen_again(s)
+
+    def high_enough_and_known(self, s: S) -> bool:
+        """The height to start again from is reached; the pad should be in view and is not."""
+        return self.high_enough(s) and self.certain(s)
 
     def searched_everywhere(self, s: S) -> bool:
         """The spiral has reached its largest radius."""
@@ -307,18 +358,14 @@ class Cone:
             m.still_since = s.time
 
     def track_pad(self, s: S) -> None:
-        """Remember where the pad is and how it moves; carry it on while it is not seen."""
+        """Remember where the pad is and how it moves, or was when that was last known."""
         m = s.memory
         if s.acquired:
             m.known = 1.0
             m.pad_x, m.pad_y, m.pad_z = s.goal_x, s.goal_y, s.goal_z
             m.pad_ux, m.pad_uy, m.pad_uz = s.pad_vx, s.pad_vy, s.pad_vz
         elif m.known > 0.0:
-            if math.hypot(m.pad_ux, m.pad_uy) < self.config.moving_speed:
-                m.pad_ux = m.pad_uy = 0.0  # what it seemed to move was the estimate's noise
-            m.pad_x += m.pad_ux * s.period
-            m.pad_y += m.pad_uy * s.period
-            m.pad_uz = 0.0
+            m.pad_ux = m.pad_uy = m.pad_uz = 0.0
         elif not math.isnan(m.goal_x):  # seen before the landing began
             m.known = 1.0
             m.pad_x, m.pad_y, m.pad_z = m.goal_x, m.goal_y, m.goal_z
@@ -326,8 +373,8 @@ class Cone:
     def follow(self, s: S) -> None:
         """Go over the pad and with it."""
         m, c = s.memory, self.config
-        # The goal is where the pad was a tick ago, and the setpoint stands for one period.
-        lead = PLANT_PERIOD + 0.5 * s.period
+        # The setpoint stands for one period; the controller moves on from it in each tick.
+        lead = 0.5 * (s.period - PLANT_PERIOD)
         x, y = self._goal(s)
         s.go_to(x + m.pad_ux * lead, y + m.pad_uy * lead, c.approach_speed)
         m.setpoint_vx, m.setpoint_vy = m.pad_ux, m.pad_uy
@@ -346,6 +393,10 @@ class Cone:
             s.go_to(m.mark_x, m.mark_y, self.config.approach_speed)
             m.target_in_use = 0.0
 
+    def _braked(self, height: float, final: float) -> float:
+        """The rate from which `braking` leaves `final` (m/s) after a descent of `height` (m)."""
+        return math.sqrt(final * final + 2.0 * self.config.braking * max(height, 0.0))
+
     def _sink(self, s: S, rate: float) -> None:
         m, c = s.memory, self.config
         s.descend_with(rate - m.pad_uz)
@@ -357,18 +408,23 @@ class Cone:
         c = self.config
         height = self._feet(s)
         inside = (self._radius(s) - self._spread(s)) / (0.3 * self._radius(s))
-        fastest = min(c.descent_speed, _VERTICAL_GAIN * max(height - c.settle_height, 0.0) + 0.05)
-        self._sink(s, min(max(inside, -0.3), 1.0) * fastest)
+        if inside < 0.0:
+            self._sink(s, max(inside, -0.3) * c.descent_speed)
+        else:
+            fastest = self._braked(height - c.settle_height, _CREEP)
+            self._sink(s, min(inside, 1.0) * min(c.descent_speed, fastest))
 
     def keep_low(self, s: S) -> None:
         """Stay with the feet just above the pad."""
-        self._sink(s, _VERTICAL_GAIN * (self._feet(s) - self.config.settle_height))
+        self._sink(s, _LOW_GAIN * (self._feet(s) - self.config.settle_height))
 
     def sit_down(self, s: S) -> None:
         """Sink to the pad or the ground."""
         c, m = self.config, s.memory
-        height = self._feet(s) if m.known > 0.0 else s.height + c.feet_height
-        self._sink(s, c.touch_speed + 0.3 * min(max(height - 1.0, 0.0), 3.0))
+        height = s.height + c.feet_height
+        if m.known > 0.0:
+            height = min(height, self._feet(s)) if s.height_measured else self._feet(s)
+        self._sink(s, min(c.descent_speed, self._braked(height - _SLOW, c.touch_speed)))
 
     def sit_down_there(self, s: S) -> None:
         """Sink where the pad should be, or anywhere if that takes too long."""
@@ -384,16 +440,26 @@ class Cone:
         s.hold_horizontally()
         s.hold_height()
 
+    def sink_to_look(self, s: S) -> None:
+        """Sink over the present place to where sensors that do not reach far see the pad."""
+        s.hold_horizontally()
+        self._sink(s, self.config.look_speed)
+
     def rise_for_view(self, s: S) -> None:
         """Stay at the present height, or rise to where the cameras see more of the pad."""
         wanted = self.config.view_height - self._feet(s)
         self._sink(s, -min(max(_VERTICAL_GAIN * wanted, 0.0), 0.5))
 
+    def note_start(self, s: S) -> None:
+        """Remember where the first attempt starts."""
+        m = s.memory
+        m.level_z, m.attempt_began = s.z, s.time
+
     def begin_attempt(self, s: S) -> None:
         """Count another attempt and choose the height to start it from."""
         m, c = s.memory, self.config
         m.attempts += 1.0
-        m.level_z = max(m.pad_z + c.retry_height, s.z + 1.0)
+        m.level_z, m.attempt_began = max(m.pad_z + c.retry_height, s.z + 1.0), s.time
 
     def climb(self, s: S) -> None:
         """Climb to the height of another attempt."""
@@ -405,7 +471,6 @@ class Cone:
         m.turn = 0.0
         known = m.known > 0.0
         m.centre_x, m.centre_y = (m.pad_x, m.pad_y) if known else (m.setpoint_x, m.setpoint_y)
-        s.hold_height()
         m.target_in_use = 0.0
 
     def _pitch(self, s: S) -> float:
@@ -416,8 +481,9 @@ class Cone:
         return self._pitch(s) * s.memory.turn / (2.0 * math.pi)
 
     def fly_spiral(self, s: S) -> None:
-        """Fly along an Archimedean spiral at constant speed."""
+        """Fly along an Archimedean spiral at constant speed, at the height of the attempt."""
         m, c = s.memory, self.config
+        s.climb_towards(m.level_z, c.climb_speed)
         pitch = self._pitch(s)
         along = math.hypot(self._spiral_radius(s), pitch / (2.0 * math.pi))
         m.turn += c.search_speed * s.period / along
@@ -442,6 +508,7 @@ class ConeConfig:
     cone_slope: NonNegative = 0.25  # 1
     sigmas: NonNegative = 2.0  # 1, k
     descent_speed: Positive = 1.2  # m/s
+    braking: Positive = 0.7  # m/s2, towards the end of a descent
     approach_speed: Positive = 5.0  # m/s, horizontal limit, ArduPilot's WPNAV_SPEED
     # The last step
     settle_height: Metres = 0.15  # m, of the feet above the pad
@@ -462,8 +529,9 @@ class ConeConfig:
     sink_gain: NonNegative = 2.5  # 1/s
     sink_push: Positive = 2.0  # m/s2, at most
     # Losses
-    moving_speed: NonNegative = 0.5  # m/s, slower than this an unseen pad is taken to rest
     look_time: Seconds = 3.0  # s, before a search begins
+    look_height: Metres = 2.0  # m, of the feet above the ground, down to which it looks first
+    look_speed: Positive = 0.7  # m/s
     hold_time: Seconds = 2.0  # s, before going round
     retry_height: Metres = 5.0  # m above the pad; the marker is seen to 6 m and more
     climb_speed: Positive = 1.5  # m/s
@@ -472,8 +540,8 @@ class ConeConfig:
     view: Positive = 0.3  # 1, tangent of half the narrower field of view: IR-LOCK's 100 x 3 mrad
     search_speed: Positive = 1.5  # m/s
     search_radius: Metres = 12.0  # m
-    maximum_attempts: int = Field(default=5, ge=1)
-    maximum_time: Positive = 120.0  # s, from the beginning of the landing
+    maximum_attempts: int = Field(default=2, ge=1)
+    maximum_time: Positive = 90.0  # s, from the beginning of the landing
     return_time: Seconds = 20.0  # s more, to fly to where it lands anyway
 
     def routine(self) -> Cone:

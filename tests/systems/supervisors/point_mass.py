@@ -46,6 +46,7 @@ class PointMass(LeafSystem):
         pad_velocity: tuple[float, float] = (0.0, 0.0),
         visible: Callable[[float, float], bool] = lambda t, z: True,
         lost_time: float = 2.0,
+        drift: float = 0.0,
         valid_from: float = 0.0,
         jump: tuple[float, float, float, float] | None = None,
         ranged: Callable[[float], bool] = lambda t: True,
@@ -61,6 +62,8 @@ class PointMass(LeafSystem):
             Whether the target is measured.
         lost_time : float
             s after which an unmeasured target is not acquired any more.
+        drift : float
+            m/s, by which one sigma of the target's place grows while it is not measured.
         valid_from : float
             s, from when the estimate is valid.
         jump : (time, x, y, z)
@@ -74,6 +77,7 @@ class PointMass(LeafSystem):
         self.pad, self.pad_velocity = np.array(pad), np.array(pad_velocity)
         self.visible, self.lost_time, self.valid_from = visible, lost_time, valid_from
         self.jump, self.ranged, self.rotors = jump, ranged, rotors
+        self.drift = drift
         # p, v, time of the last sighting, thrust
         self.DeclareDiscreteState([*start, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0])
         self.DeclareVectorInputPort("setpoint", SETPOINT.size)
@@ -147,6 +151,8 @@ class PointMass(LeafSystem):
         pad = self.pad + self.pad_velocity * t
         target.p_BP_W_x, target.p_BP_W_y = pad - state[:2]
         target.p_BP_W_z = -state[2]
+        spread = (self.drift * (t - state[6])) ** 2
+        target.position_variance_x = target.position_variance_y = spread
         target.v_WP_x, target.v_WP_y = self.pad_velocity
         output.SetFromVector(target[:])
 

@@ -96,14 +96,14 @@ def test_lands_on_a_moving_pad(velocity):
 
 
 def test_rises_when_it_loses_sight_and_goes_on():
-    flight = fly(visible=lambda t, z: not 5.0 < t < 8.5)
+    flight = fly(visible=lambda t, z: not 7.0 < t < 10.0)
     assert ("hold", "descend") in flight.transitions
     assert flight.landed
     np.testing.assert_allclose(flight.position[:2], PAD, atol=0.03)
 
 
 def test_goes_round_when_sight_is_lost_for_long():
-    flight = fly(visible=lambda t, z: not 5.0 < t < 12.0)
+    flight = fly(visible=lambda t, z: not 7.0 < t < 16.0)
     assert ("hold", "go_round") in flight.transitions
     assert flight.landed
     assert flight.status.attempts[-1] == 2.0
@@ -118,9 +118,44 @@ def test_attempts_are_bounded_when_the_pad_is_never_seen_close_by():
     np.testing.assert_allclose(flight.position[:2], PAD, atol=0.3)
 
 
+BLIND = {"lost_time": 1e9, "drift": 0.05}  # known ever less, as the estimator says
+
+
+def test_what_is_not_seen_from_the_beginning_is_landed_on_at_once():
+    """Another attempt would see no more, and waiting only makes it worse."""
+    flight = fly(visible=lambda t, z: t < 4.5, **BLIND)
+    assert flight.landed
+    assert ("descend", "land_anyway") in flight.transitions
+    assert flight.status.attempts[-1] == 1.0
+    assert flight.landing_time < 12.0
+
+
+def test_what_is_seen_from_close_by_alone_is_found_on_the_way_down():
+    flight = fly(visible=lambda t, z: t < 4.5 or z < 1.5, **BLIND)
+    assert flight.landed
+    assert "touch" in flight.states
+    assert flight.status.attempts[-1] == 1.0
+
+
+def test_what_is_seen_from_above_alone_is_looked_at_once_more():
+    flight = fly(visible=lambda t, z: z > 3.0, **BLIND)
+    assert flight.landed
+    assert ("hold", "go_round") in flight.transitions
+    assert flight.states[-2] in ("land_anyway", "touch")
+    assert flight.status.attempts[-1] == 2.0
+    assert flight.landing_time < 40.0
+
+
+def test_a_pad_that_was_never_seen_is_found_from_further_down():
+    flight = fly(visible=lambda t, z: 0.0 < z < 3.0 and t > 4.0)
+    assert ("look_lower", "descend") in flight.transitions
+    assert flight.landed
+    np.testing.assert_allclose(flight.position[:2], PAD, atol=0.05)
+
+
 def test_searches_a_spiral_and_then_lands_anyway():
     flight = fly(visible=lambda t, z: False)
-    assert ("look", "search") in flight.transitions
+    assert {("look", "look_lower"), ("look_lower", "search")} <= flight.transitions
     assert ("search", "land_anyway") in flight.transitions
     assert flight.landed
     np.testing.assert_allclose(flight.position[:2], (2.0, 0.0), atol=0.3)  # where it climbed
@@ -180,6 +215,17 @@ def test_never_a_hard_landing():
 def descent(s):
     Cone(settings()).descend_in_cone(s)
     return -s.memory.setpoint_vz
+
+
+def test_outside_the_cone_it_climbs_near_the_pad_too():
+    assert descent(situation(z=0.2, x=0.5)) < -0.2
+
+
+def test_the_nearer_of_ground_and_pad_is_braked_for():
+    """The pad was last known 1 m too low."""
+    s = situation(z=1.2, height=0.2, height_measured=True)
+    Cone(settings()).sit_down(s)
+    assert -s.memory.setpoint_vz == pytest.approx(settings().touch_speed)
 
 
 def test_uncertainty_stops_the_descent_as_an_error_does():
