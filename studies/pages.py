@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import cramervonmises_2samp
 
 from studies import figures, maps
 from studies.campaign import summarise_again
-from studies.published import PUBLISHED
+from studies.published import PUBLISHED, SIGNIFICANCE
 from studies.report import samples
 from studies.study import Study
 from studies.summary import agreement, rate, scale_of, show, show_rate, with_measures
@@ -129,7 +130,25 @@ def _distributions(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]
             show(numbers[measures.time]["mean"], 1.0),
         ]
         lines.append(f"| {' | '.join(cells)} |")
+    if len(summary["conditions"]) == 2:
+        lines += ["", _told_apart(study, table, summary)]
     return [*lines, ""]
+
+
+def _told_apart(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> str:
+    """Whether the landings of two conditions can be told apart, by the test of `published`."""
+    landed = table[table[study.measures.success].eq(True)]
+    names = [condition["condition"] for condition in summary["conditions"]]
+    found = []
+    for column, title in ((study.measures.error, "landing error"), (study.measures.time, "time")):
+        sides = [landed.loc[landed["condition"].eq(name), column].dropna() for name in names]
+        if min(map(len, sides)) < 2:
+            return "Too few have landed for a test."
+        p = cramervonmises_2samp(*sides).pvalue
+        found.append(
+            f"{title} p = {p:.2g}, {'cannot' if p >= SIGNIFICANCE else '**can**'} be told apart"
+        )
+    return f"Two-sample Cramér–von Mises tests, {SIGNIFICANCE:.0%}: {'; '.join(found)}."
 
 
 def _draw(study: Study, table: pd.DataFrame, summary: Mapping[str, Any], data: Path) -> None:

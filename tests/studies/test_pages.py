@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pandas as pd
+from scipy.stats import cramervonmises_2samp
 
 from studies import pages
 from studies.campaign import run_study
@@ -24,10 +25,17 @@ def test_a_page_gets_the_tables_figures_and_rows_of_its_campaign(tmp_path: Path)
     text = (docs / "mine.md").read_text()
     assert text.startswith("# Words")
     assert text.endswith("More words.\n")
-    assert "old" not in text
+    assert "\nold\n" not in text
     assert f"{RUNS} landings, {RUNS // 2} a row" in text
     for condition in ("narrow", "wide"):
         assert f"| {condition} | " in text
+    landed = result.table[result.table["landed"]]
+    narrow, wide = (
+        landed.loc[landed["condition"].eq(name), "landing_error_m"] for name in ("narrow", "wide")
+    )
+    p = cramervonmises_2samp(narrow, wide).pvalue  # two conditions are held against each other
+    verdict = "cannot" if p >= 0.01 else "**can**"
+    assert f"landing error p = {p:.2g}, {verdict} be told apart" in text
     assert (docs / "other.md").read_text() == PAGE.format("another")
 
     kept = pd.read_csv(docs / "data" / "toy.csv")
