@@ -20,7 +20,7 @@ from systems.frames import (
     rotation_matrix,
 )
 from systems.schedule import CLOCK_PERIOD
-from systems.sensors.svgs_camera import _FRAME_GAIN, SvgsCamera, SvgsCameraConfig
+from systems.sensors.svgs_camera import FRAME_GAIN, SvgsCamera, SvgsCameraConfig
 from systems.signals.measurement import BODY_STATE, SVGS
 from systems.vision.exposure import SMEAR
 from systems.vision.pinhole import pixel_of_tangents
@@ -194,7 +194,7 @@ def fly(config: SvgsCameraConfig, height: float, frames: int, seed: int = 1) -> 
         true = R_WC.T @ (placement[:3] - exposure[4:7])
         R_CT = R_WC.T @ rotation_matrix(quaternion_from_yaw(placement[3]))
         result.errors.append(measurement[_P] - true)
-        gain = context.get_discrete_state(2).value()[_FRAME_GAIN]
+        gain = context.get_discrete_state(2).value()[FRAME_GAIN]
         spots = np.empty((MAXIMUM_SPOTS, SPOT_SIZE))
         count = project_lamps(exposure, camera._lamps, gain, camera.camera, spots)
         pixels = led_pixels(camera, exposure, beacon)

@@ -66,17 +66,26 @@ def live_view(landing: LandingDiagram, scenario: MultirotorLanding) -> Callable:
     The page's address is `meshcat().web_url()`.
     """
     scene = _scene(scenario)
+    return paced(
+        lambda context: move(
+            scene, landing.evaluate("body", context), landing.evaluate("pad", context)
+        )
+    )
+
+
+def paced(show: Callable[[Context], None]) -> Callable[[Context], EventStatus]:
+    """A monitor that calls `show` every 40 ms of simulated time."""
     shown = -1.0
 
-    def show(context: Context) -> EventStatus:
+    def monitor(context: Context) -> EventStatus:
         nonlocal shown
         time = context.get_time()
         if time >= shown + _LIVE_PERIOD:
             shown = time
-            move(scene, landing.evaluate("body", context), landing.evaluate("pad", context))
+            show(context)
         return EventStatus.DidNothing()
 
-    return show
+    return monitor
 
 
 def _scene(scenario: MultirotorLanding) -> Meshcat:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pyarrow as pa
 from pydrake.geometry import Meshcat, Rgba
-from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.framework import Context
 
 from diagrams.landing_without_gps import (
     RECORDED,
@@ -15,13 +15,12 @@ from diagrams.landing_without_gps import (
 from plants.fixed_wing import FixedWingConfig
 from plants.runway_illustration import Lens, draw_runway, in_picture, move_world, positions
 from runs.logs import port_samples
-from runs.replay_3d import PATH, empty_scene, recorded_page, rows
+from runs.replay_3d import PATH, empty_scene, paced, recorded_page, rows
 from systems.controllers.fixed_wing_guidance import landing_altitude
 from systems.signals.runway_measurement import NAVIGATION_ESTIMATE
 
 _SHOWN = ("state", "estimate", "antenna", "picture")
 _FRAMES = 3000  # of a replay at most: Meshcat moves evenly from one to the next
-_LIVE_PERIOD = 0.04  # s of simulated time between two poses of the live view
 _TRUTH = Rgba(0.0, 0.45, 0.70, 1.0)
 _ESTIMATE = Rgba(0.34, 0.71, 0.91, 1.0)
 _PLAN = Rgba(0.90, 0.62, 0.0, 1.0)
@@ -60,18 +59,12 @@ def runway_live_view(
 ) -> Callable:
     """A monitor for `Simulator.set_monitor` that shows the flight as it happens."""
     scene, lens = _scene(scenario), _lens(scenario)
-    shown = -1.0
 
-    def show(context: Context) -> EventStatus:
-        nonlocal shown
-        time = context.get_time()
-        if time >= shown + _LIVE_PERIOD:
-            shown = time
-            now = {port: landing.evaluate(port, context) for port in _SHOWN}
-            move_world(scene, now, scenario.runway, lens, PATH)
-        return EventStatus.DidNothing()
+    def show(context: Context) -> None:
+        now = {port: landing.evaluate(port, context) for port in _SHOWN}
+        move_world(scene, now, scenario.runway, lens, PATH)
 
-    return show
+    return paced(show)
 
 
 def _latest(log: pa.Table, port: str, times: np.ndarray) -> np.ndarray:

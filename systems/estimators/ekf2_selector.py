@@ -4,6 +4,7 @@ The decision is PX4's; its equations stand in `ekf2_selection`.
 """
 
 import math
+from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
@@ -23,9 +24,11 @@ from systems.estimators.ekf2.messages import INNOVATIONS, STATUS
 from systems.frames import yaw_of
 from systems.schedule import SUPERVISOR_PERIOD
 from systems.signals.measurement import INERTIAL, VEHICLE_ESTIMATE, Layout, vector
+from systems.signals.optional_input import optional_input
 
 SELECTOR_PERIOD = SUPERVISOR_PERIOD  # s; PX4 looks at every filter step
-_PORTS = ("estimate", "innovations", "status", "imu")  # of each instance
+# of each instance, before its sensor
+_PORTS = {"estimate": VEHICLE_ESTIMATE, "innovations": INNOVATIONS, "status": STATUS}
 _DEGREE = math.pi / 180.0
 
 _P = VEHICLE_ESTIMATE.slice("p_WB")
@@ -157,10 +160,14 @@ class Ekf2Selector(LeafSystem):
         super().__init__()
         self.config = config
         n = config.instances
-        sizes = (VEHICLE_ESTIMATE.size, INNOVATIONS.size, STATUS.size, INERTIAL.size)
+        self._read: dict[str, list[Callable]] = {name: [] for name in (*_PORTS, "imu")}
         for i in range(n):
-            for name, size in zip(_PORTS, sizes, strict=True):
-                self.DeclareVectorInputPort(f"{name}_{i}", size)
+            for name, layout in _PORTS.items():
+                self._read[name].append(
+                    self.DeclareVectorInputPort(f"{name}_{i}", layout.size).Eval
+                )
+            imu = self.DeclareVectorInputPort(f"imu_{i}", INERTIAL.size)
+            self._read["imu"].append(optional_input(imu, np.full(INERTIAL.size, math.nan)))
         initial = np.concatenate([np.zeros(_MEMORY), decision.initial_memory(n)])
         initial[_H_THEN] = initial[_V_THEN] = -1.0
         self.DeclareDiscreteState(BasicVector(initial))
@@ -187,12 +194,11 @@ class Ekf2Selector(LeafSystem):
         self.config = config
 
     def _input(self, context: Context, name: str, instance: int) -> np.ndarray:
-        port = self.get_input_port(len(_PORTS) * instance + _PORTS.index(name))
-        return port.Eval(context) if port.HasValue(context) else np.full(port.size(), math.nan)
+        return self._read[name][instance](context)
 
     def _inputs(self, context: Context, name: str) -> np.ndarray:
-        """Those of all instances, a row each; nan where nothing is connected."""
-        return np.stack([self._input(context, name, i) for i in range(self.config.instances)])
+        """Those of all instances, a row each."""
+        return np.stack([read(context) for read in self._read[name]])
 
     def _calc_estimate(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state(0).value()

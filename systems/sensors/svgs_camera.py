@@ -41,7 +41,7 @@ from systems.vision.svgs_blobs import (
 
 _BLOB_COUNT = SVGS.index("blob_count")
 # The host's own state: when the next frame begins, exposures of the next and of the last frame.
-_NEXT_FRAME, _GAIN, _FRAME_GAIN = range(3)
+_NEXT_FRAME, _GAIN, FRAME_GAIN = range(3)
 _TRACK = slice(3, 3 + selection.TRACK.size)
 _LAST = slice(_TRACK.stop, _TRACK.stop + 24)
 _HOST_SIZE = _LAST.stop
@@ -170,7 +170,7 @@ class SvgsCamera(PadCamera):
         initial[SVGS.index("error_code")] = selection.NO_BLOBS
         super().__init__(config, seed, "svgs_camera", initial)
         host = np.zeros(_HOST_SIZE)
-        host[_GAIN] = host[_FRAME_GAIN] = 1.0
+        host[_GAIN] = host[FRAME_GAIN] = 1.0
         self.DeclareDiscreteState(host)
 
     def configure(self, config: SvgsCameraConfig, seed: int = 0) -> None:
@@ -230,7 +230,7 @@ class SvgsCamera(PadCamera):
         if now < context.get_discrete_state(2).value()[_NEXT_FRAME] - _TICK:
             return
         host: Any = values.get_mutable_value(2)
-        gain = host[_FRAME_GAIN] = host[_GAIN]
+        gain = host[FRAME_GAIN] = host[_GAIN]
         exposure, measurement, frame = self._expose(
             context, values, gain * self.config.longest_exposure
         )
@@ -273,6 +273,6 @@ class SvgsCamera(PadCamera):
         host[_NEXT_FRAME] = due + self._period(measurement[_BLOB_COUNT], frame)
 
     def _image(self, context: Context, exposure: np.ndarray, frame: int) -> np.ndarray:
-        gain = context.get_discrete_state(2).value()[_FRAME_GAIN]
+        gain = context.get_discrete_state(2).value()[FRAME_GAIN]
         planes = self._render(exposure, gain, frame)
         return np.ascontiguousarray(np.moveaxis(planes[::-1], 0, -1))
