@@ -61,7 +61,6 @@ _VERTICAL_GAIN = 1.0  # 1/s, height error to speed
 _LOW_GAIN = 2.0  # 1/s, the same just above the pad
 _CREEP = 0.05  # m/s, at the end of the descent in the cone
 _SLOW = 0.3  # m, of the feet above the pad, below which the vehicle does not brake any more
-_SLIP = 0.03  # s, of the pad's way: 6 cm of one at 2 m/s
 _CLOSE = 0.12  # m, of the feet above the pad, within which a push from below is the ground
 _AT_PAD = 0.06  # m, of the feet above the pad, at which one foot of a tilted vehicle may stand
 _ORDERED = 0.2  # m/s, rate of descent from which on not to sink means something
@@ -154,21 +153,27 @@ class Cone:
 
     # -- what is known
 
+    def _pad(self, s: S) -> tuple[float, float, float]:
+        """Where the pad is now, or was when that was last known.
+
+        Guards come before actions: what `track_pad` remembers is an event old for them, 12 cm of
+        a pad at 3 m/s.
+        """
+        m = s.memory
+        return (s.goal_x, s.goal_y, s.goal_z) if s.acquired else (m.pad_x, m.pad_y, m.pad_z)
+
     def _feet(self, s: S) -> float:
         """The height of the feet above the pad, m."""
-        return s.z - s.memory.pad_z + self.config.feet_height
+        return s.z - self._pad(s)[2] + self.config.feet_height
 
     def _goal(self, s: S) -> tuple[float, float]:
         """Where the body must be so that it stands over the pad after it has come down level.
 
-        It leans into the wind by −d̂/g, and will fall back on its feet; under them a pad that moves
-        slips away until the rotors have stopped.
+        It leans into the wind by −d̂/g, and will fall back on its feet.
         """
         m, share = s.memory, self.config.feet_height / _GRAVITY
-        return (
-            m.pad_x + share * m.drift_ax + _SLIP * m.pad_ux,
-            m.pad_y + share * m.drift_ay + _SLIP * m.pad_uy,
-        )
+        x, y, _ = self._pad(s)
+        return x + share * m.drift_ax, y + share * m.drift_ay
 
     def _error(self, s: S) -> tuple[float, float]:
         x, y = self._goal(s)

@@ -246,6 +246,17 @@ def test_touches_down_when_the_prediction_is_good_and_sooner_or_later():
     assert cone.aligned(situation(**low, x=0.06, entered=50.0 - patience))
 
 
+def test_what_moves_is_where_it_is_now_when_decisions_are_made():
+    """A guard comes before `track_pad`: what the memory holds of the pad is an event old."""
+    cone = Cone(settings())
+    s = situation(z=0.15, x=0.12, vx=3.0, pad_ux=3.0, entered=50.0)
+    assert not cone.aligned(s)
+    s.goal_x = 0.12
+    assert cone.aligned(s)
+    s.goal_z = -0.2
+    assert not cone.aligned(s)
+
+
 def test_misses_are_aborted_while_there_is_room():
     cone = Cone(settings())
     assert cone.missing_pad(situation(z=0.1, x=0.2))
