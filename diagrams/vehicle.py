@@ -8,7 +8,8 @@ from diagrams.blocks import Blocks
 def world(blocks: Blocks) -> Diagram:
     """What moves and what can be seen.
 
-    Exports the input `rotor_commands` and the outputs `body`, `rotor_speeds`, `wind`, `pad`.
+    Exports the inputs `rotor_commands`, `supervisor` and the outputs `body`, `rotor_speeds`,
+    `wind`, `pad`.
     """
     builder = DiagramBuilder()
     multirotor = blocks.add(builder, "vehicle", "multirotor")
@@ -19,6 +20,7 @@ def world(blocks: Blocks) -> Diagram:
     builder.Connect(pad.GetOutputPort("pad"), multirotor.GetInputPort("pad"))
     builder.Connect(body, wind.GetInputPort("body"))
     builder.ExportInput(multirotor.GetInputPort("rotor_commands"), "rotor_commands")
+    builder.ExportInput(pad.GetInputPort("supervisor"), "supervisor")
     builder.ExportOutput(body, "body")
     builder.ExportOutput(multirotor.GetOutputPort("rotor_speeds"), "rotor_speeds")
     builder.ExportOutput(wind.GetOutputPort("wind"), "wind")

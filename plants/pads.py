@@ -21,10 +21,12 @@ from systems.configuration import (
     configuration,
     require_same_structure,
 )
-from systems.signals.measurement import MARKER_LEVELS, PAD_STATE
+from systems.signals.measurement import MARKER_LEVELS, PAD_STATE, SUPERVISOR_STATUS
 
 MARKER_DICTIONARY = "DICT_4X4_100"  # OpenCV's name; 4 x 4 bits in a border one cell wide
 MARKER_CELLS = 6  # cells a side, with the border
+
+_LANDING_STARTED = SUPERVISOR_STATUS.index("landing_started")
 
 
 def _zeros() -> list[float]:
@@ -98,7 +100,9 @@ class PadConfig:
     circle_speed: NonNegative = 0.0  # m/s along it
     heave_amplitude: Metres = 0.0  # m, of a vertical sine that starts upward
     heave_period: Positive = 8.0  # s
-    motion_start: Seconds = 0.0  # s, when the motion begins
+    # s, when the motion begins: after the start of the run, or once the landing routine took over
+    motion_start: Seconds = 0.0
+    motion_from: Literal["start", "landing"] = "start"
     marker: NestedMarkerConfig | None = Field(default_factory=NestedMarkerConfig)
     beacon: InfraredBeaconConfig | None = Field(default_factory=InfraredBeaconConfig)
 
@@ -110,7 +114,7 @@ class PadConfig:
         return drives or circles or self.heave_amplitude > 0.0
 
     def state(self, time: float) -> np.ndarray[Any, Any]:
-        """The `PAD_STATE` at a time (s)."""
+        """The `PAD_STATE` at a time (s) since what `motion_from` names; at rest before."""
         t = time - self.motion_start
         x, y, z = self.position
         if t < 0.0 or not self.moves:
@@ -141,23 +145,28 @@ class Pad(LeafSystem):
     .. pydrake_system::
 
         name: Pad
+        input_ports:
+        - supervisor (optional)
         output_ports:
         - pad
 
     | port | layout | meaning |
     |---|---|---|
+    | `supervisor` (optional) | `SUPERVISOR_STATUS` | needed where the landing sets the pad off |
     | `pad` | `PAD_STATE` | pose and velocity of the middle of the pad's top |
 
     p(t) = p₀ + v t + r (sin φ, 1 − cos φ, 0) + (0, 0, h sin 2πt/T), φ = speed · t/r,
-    exact at every t; the output of a pad at rest is calculated once a run. It
-    has no events.
+    exact at every t, which counts from `motion_start` after the start or after the landing has
+    begun; the output of a pad at rest is calculated once a run. It has no events.
     """
 
     def __init__(self, config: PadConfig, seed: int = 0):
         super().__init__()
         self._config = config
-        ticket = self.time_ticket() if config.moves else self.nothing_ticket()
-        self.DeclareVectorOutputPort("pad", PAD_STATE.size, self._calc_pad, {ticket})
+        self._supervisor = self.DeclareVectorInputPort("supervisor", SUPERVISOR_STATUS.size)
+        moving = {self.time_ticket(), self.input_port_ticket(self._supervisor.get_index())}
+        tickets = moving if config.moves else {self.nothing_ticket()}
+        self.DeclareVectorOutputPort("pad", PAD_STATE.size, self._calc_pad, tickets)
 
     def configure(self, config: PadConfig, seed: int = 0) -> None:
         """Another pad, for contexts made from now on; one at rest cannot begin to move."""
@@ -170,4 +179,8 @@ class Pad(LeafSystem):
         return self._config
 
     def _calc_pad(self, context: Any, output: Any) -> None:
-        output.SetFromVector(self._config.state(context.get_time()))
+        config, time = self._config, context.get_time()
+        if config.moves and config.motion_from == "landing":
+            began = self._supervisor.Eval(context)[_LANDING_STARTED]
+            time = time - began if began >= 0.0 else -math.inf
+        output.SetFromVector(config.state(time))

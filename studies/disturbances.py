@@ -245,7 +245,7 @@ def _write_start(draft: Draft, distance: float, direction: float) -> None:
 
 def _write_pad_speed(draft: Draft, speed: float, direction: float) -> None:
     draft["pad.velocity"] = _towards(speed, direction)
-    draft["pad.motion_start"] = draft.window.at(0.0)
+    draft["pad.motion_from"] = "landing"
 
 
 def _write_heave(draft: Draft, amplitude: float, period: float) -> None:

@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 
 from plants.pads import MARKER_DICTIONARY, MarkerLevelConfig, NestedMarkerConfig, Pad, PadConfig
 from systems.configuration import StructureChangedError
-from systems.signals.measurement import PAD_STATE
+from systems.signals.measurement import PAD_STATE, SUPERVISOR_STATUS
 from tests.system_contract import assert_matches_docstring
 
 MOTIONS = {
@@ -66,6 +66,18 @@ def test_motion_begins_when_it_should():
     config = PadConfig(**MOTIONS["ferry"])
     np.testing.assert_array_equal(pad_at(config, 1.9)[4:8], 0.0)
     assert np.linalg.norm(pad_at(config, 2.1)[4:7]) > 1.0
+
+
+def test_the_landing_sets_it_off():
+    pad = Pad(PadConfig(velocity=[2.0, 0.0, 0.0], motion_from="landing", motion_start=1.0))
+    context = pad.CreateDefaultContext()
+    context.SetTime(40.0)
+    status = SUPERVISOR_STATUS.zeros()
+    for landing_started, moved in ((-1.0, 0.0), (39.5, 0.0), (30.0, 18.0)):
+        status[SUPERVISOR_STATUS.index("landing_started")] = landing_started
+        pad.GetInputPort("supervisor").FixValue(context, status)
+        state = pad.GetOutputPort("pad").Eval(context)
+        assert (state[0], state[4]) == (moved, 2.0 if moved else 0.0)
 
 
 def test_a_circle_comes_back():
