@@ -72,6 +72,8 @@ class ConeMemory(Memory):
 
     drift_ax: float = 0.0  # m/s2, low-passed disturbance
     drift_ay: float = 0.0
+    lean_ax: float = 0.0  # m/s2, the same without gusts
+    lean_ay: float = 0.0
     held_ax: float = 0.0  # m/s2, what of it the controller's integrator holds
     held_ay: float = 0.0
     push: float = math.nan  # m/s2, low-passed vertical disturbance
@@ -169,11 +171,17 @@ class Cone:
     def _goal(self, s: S) -> tuple[float, float]:
         """Where the body must be so that it stands over the pad after it has come down level.
 
-        It leans into the wind by −d̂/g, and will fall back on its feet.
+        It leans into the wind by −d̂/g, and will fall back on its feet. Its cameras lean with it:
+        once they have seen the pad it stays so far upwind, high up, that they look at it.
         """
         m, share = s.memory, self.config.feet_height / _GRAVITY
         x, y, _ = self._pad(s)
-        return x + share * m.drift_ax, y + share * m.drift_ay
+        seen = m.last_fusion > m.attempt_began
+        high = max(self._feet(s) - self.config.settle_height, 0.0) / _GRAVITY if seen else 0.0
+        return (
+            x + share * m.drift_ax - high * m.lean_ax,
+            y + share * m.drift_ay - high * m.lean_ay,
+        )
 
     def _error(self, s: S) -> tuple[float, float]:
         x, y = self._goal(s)
@@ -341,10 +349,14 @@ class Cone:
         age = s.time - m.landing_started
         if age < s.period:
             m.drift_ax, m.drift_ay = drift_x, drift_y
+            m.lean_ax, m.lean_ay = drift_x, drift_y
             m.held_ax, m.held_ay = drift_x, drift_y
         gain = 1.0 - math.exp(-s.period / c.drift_time)
         m.drift_ax += gain * (drift_x - m.drift_ax)
         m.drift_ay += gain * (drift_y - m.drift_ay)
+        gain = 1.0 - math.exp(-s.period / c.lean_time)
+        m.lean_ax += gain * (drift_x - m.lean_ax)
+        m.lean_ay += gain * (drift_y - m.lean_ay)
         m.setpoint_ax = m.setpoint_ay = m.setpoint_az = 0.0
         if age < c.learning_time:  # a mean
             share = s.period / (age + s.period)
@@ -527,6 +539,7 @@ class ConeConfig:
     push_time: Positive = 0.3  # s, low pass of what it jumps from
     # The wind
     drift_time: Positive = 0.15  # s, low pass of the disturbance
+    lean_time: Positive = 5.0  # s, low pass of the disturbance that the cone leans against
     learning_time: Seconds = 1.0  # s, at the beginning, of the mean d₀
     rotor_lag: Positive = 0.055  # s, of the rotors' thrust behind their command
     position_gain: NonNegative = 1.5  # 1/s2

@@ -246,6 +246,19 @@ def test_touches_down_when_the_prediction_is_good_and_sooner_or_later():
     assert cone.aligned(situation(**low, x=0.06, entered=50.0 - patience))
 
 
+def test_high_up_the_leaning_cameras_look_at_the_pad_once_they_have_seen_it():
+    cone = Cone(settings())
+    s = situation(z=4.0, lean_ax=3.0, attempt_began=20.0, last_fusion=19.0)
+    assert cone._goal(s) == (0.0, 0.0)  # blind from the beginning: straight down
+    s.memory.last_fusion = 45.0
+    x, y = cone._goal(s)
+    # Thrust leans to -3/g: so does the cameras' axis, which meets the ground above the pad.
+    assert x + (4.0 - settings().settle_height) * 3.0 / GRAVITY == pytest.approx(0.0)
+    assert y == 0.0
+    s.z = 0.1
+    assert cone._goal(s) == (0.0, 0.0)
+
+
 def test_what_moves_is_where_it_is_now_when_decisions_are_made():
     """A guard comes before `track_pad`: what the memory holds of the pad is an event old."""
     cone = Cone(settings())
