@@ -2,10 +2,10 @@
 
     python -m studies.pages out/studies/infrared-and-marker [MORE FOLDERS] [--docs docs]
 
-Every folder of a campaign of study NAME leaves `docs/data/NAME.csv` (its rows, rounded; of a study
-with axes its cells, with intervals) and `docs/data/NAME-*.svg`, and fills the block of each page
-that asks for it, ``<!-- campaign NAME -->`` to ``<!-- end -->``. The words around the blocks are
-written by hand.
+Every folder of a campaign of study NAME leaves `docs/data/NAME.csv` and `docs/data/NAME-*.svg`, and
+fills the block of each page that asks for it, ``<!-- campaign NAME -->`` to ``<!-- end -->``. The
+CSV holds the campaign's rows, rounded, or if it has axes or many landings a row a cell, with
+intervals. The words around the blocks are written by hand.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from studies.study import Study
 from studies.summary import agreement, rate, scale_of, show, show_rate, with_measures
 
 FAR = 0.5  # m, a landing farther out than this has missed
+KEPT = 2000  # landings, 150 kB: a larger campaign's rows stay in its folder
 DECIMALS = 4  # of the kept rows: 0.1 mm, 0.1 ms
 
 
@@ -36,7 +37,7 @@ def write(folder: Path, docs: Path) -> None:
     table = with_measures(study, result.table)
     data = docs / "data"
     data.mkdir(parents=True, exist_ok=True)
-    if study.axes:
+    if study.axes or len(table) > KEPT:
         rows = maps.cell_table(study, result.summary)
     else:
         rows = table[["run", "condition", *study.measures.columns()]]

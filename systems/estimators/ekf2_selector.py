@@ -193,9 +193,6 @@ class Ekf2Selector(LeafSystem):
         require_same_structure(self.config, config, "instances")
         self.config = config
 
-    def _input(self, context: Context, name: str, instance: int) -> np.ndarray:
-        return self._read[name][instance](context)
-
     def _inputs(self, context: Context, name: str) -> np.ndarray:
         """Those of all instances, a row each."""
         return np.stack([read(context) for read in self._read[name]])
@@ -220,7 +217,7 @@ class Ekf2Selector(LeafSystem):
 
     def _selected_estimate(self, context: Context, state: np.ndarray) -> np.ndarray:
         """The selected instance's estimate, its reset counters carried over changes."""
-        estimate = self._input(context, "estimate", int(state[_MEMORY + decision.SELECTED])).copy()
+        estimate = self._read["estimate"][int(state[_MEMORY + decision.SELECTED])](context).copy()
         if estimate[_H_COUNTER] == state[_H_THEN]:  # no reset of its own since the change
             estimate[_H_RESET] = state[_JUMP : _JUMP + 2]
         if estimate[_V_COUNTER] == state[_V_THEN]:

@@ -3,11 +3,14 @@
 The vehicle may be at a height h of its feet above the pad only where the place of the pad is
 known and close enough,
 
-    |e| + k σ ≤ ρ(h) = cone_radius + cone_slope h,
+    |e| + k σ ≤ ρ(h) = cone_radius + cone_slope h,   e = p_pad + (h_feet d̂ − h₊ d̄)/g − p,
 
 e being the horizontal error and σ the target's standard deviation, which grows while the pad is
-not seen: inside it descends, outside it waits, far outside it climbs. Close to the pad it
-waits for a moment at which
+not seen: inside it descends, outside it waits, far outside it climbs. The axis leans with the
+vehicle: by h_feet (of the feet in B) because a body that leans against the disturbance d̂ falls
+back on its feet; and by h₊ = h − settle_height, once the pad has been seen in this attempt, so
+that cameras that lean against the mean wind d̄ keep it in the middle of their view. Close to the
+pad it waits for a moment at which
 
     |e + v τ| + σ ≤ r,   r growing from touch_radius to touch_radius_limit while it waits,
 
@@ -18,7 +21,8 @@ besides its rotors is observed and fed forward with the opposite sign (a disturb
 Ohnishi, Shibata, Murakami, "Motion control for advanced mechatronics", IEEE/ASME T-Mech 1(1),
 1996), and near the pad the position loop is stiffened,
 
-    d = a − g c/c_hover z_B,   d̂ ← low pass of d,   d₀ its mean as the landing begins
+    d = a − g c/c_hover z_B,   d̂, d̄ ← low passes of d (drift_time, lean_time),
+    d₀ its mean as the landing begins
     a_setpoint = d₀ − d̂ + position_gain e + velocity_gain (v_pad − v)
     a_setpoint,z = sink_gain (v_setpoint,z − v_z)
 
@@ -176,8 +180,8 @@ class Cone:
         """
         m, share = s.memory, self.config.feet_height / _GRAVITY
         x, y, _ = self._pad(s)
-        seen = m.last_fusion > m.attempt_began
-        high = max(self._feet(s) - self.config.settle_height, 0.0) / _GRAVITY if seen else 0.0
+        height = self._feet(s) - self.config.settle_height
+        high = max(height, 0.0) / _GRAVITY if self._seen_in_attempt(s) else 0.0
         return (
             x + share * m.drift_ax - high * m.lean_ax,
             y + share * m.drift_ay - high * m.lean_ay,
@@ -224,8 +228,11 @@ class Cone:
     def _sees_more_from_above(self, s: S) -> bool:
         """Whether this attempt, not the last one, has seen the pad on its way down."""
         m, c = s.memory, self.config
-        sunk = m.last_fusion > m.attempt_began and m.sighting_z < m.level_z - c.tolerance
-        return sunk and m.attempts < c.maximum_attempts
+        sunk = m.sighting_z < m.level_z - c.tolerance
+        return self._seen_in_attempt(s) and sunk and m.attempts < c.maximum_attempts
+
+    def _seen_in_attempt(self, s: S) -> bool:
+        return s.memory.last_fusion > s.memory.attempt_began
 
     def seen_again(self, s: S) -> bool:
         """The pad has been seen in this state, and its place is certain enough."""

@@ -11,15 +11,19 @@ RUNS = 24
 PAGE = "# Words\n\n<!-- campaign {} -->\nold\n<!-- end -->\n\nMore words.\n"
 
 
-def test_a_page_gets_the_tables_figures_and_rows_of_its_campaign(tmp_path: Path):
+def flown(folder: Path):
     study = slow_study()
     study.measures.others = ["touchdown_speed_m_s"]
     study.experiment = "tests.studies.toy:Gentle"
+    return run_study(study, folder, RUNS, workers=0, progress=False)
+
+
+def test_a_page_gets_the_tables_figures_and_rows_of_its_campaign(tmp_path: Path):
     folder, docs = tmp_path / "campaign", tmp_path / "docs"
     docs.mkdir()
     (docs / "mine.md").write_text(PAGE.format("toy"))
     (docs / "other.md").write_text(PAGE.format("another"))
-    result = run_study(study, folder, RUNS, workers=0, progress=False)
+    result = flown(folder)
     pages.write(folder, docs)
 
     text = (docs / "mine.md").read_text()
@@ -47,3 +51,18 @@ def test_a_page_gets_the_tables_figures_and_rows_of_its_campaign(tmp_path: Path)
 
     pages.write(folder, docs)  # the same again
     assert (docs / "mine.md").read_text() == text
+
+
+def test_of_a_large_campaign_a_row_a_condition_is_kept(tmp_path: Path, monkeypatch):
+    folder, docs = tmp_path / "campaign", tmp_path / "docs"
+    result = flown(folder)
+    docs.mkdir()
+    monkeypatch.setattr(pages, "KEPT", RUNS - 1)
+    pages.write(folder, docs)
+    kept = pd.read_csv(docs / "data" / "toy.csv").set_index("runs_of")
+    assert sorted(kept.index) == ["narrow", "wide"]
+    landed = result.table[result.table["landed"]]
+    means = landed.groupby("condition")["landing_error_m"].mean()
+    for condition, row in kept.iterrows():
+        assert abs(row["landing_error_m_mean"] - means[condition]) < 1e-4
+        assert row["landing_error_m_mean_low"] < means[condition] < row["landing_error_m_mean_high"]

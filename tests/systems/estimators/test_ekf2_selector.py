@@ -98,6 +98,12 @@ def test_topology():
         selector.configure(Ekf2SelectorConfig(instances=2))
 
 
+def test_what_must_be_connected_is_an_error_unconnected():
+    selector = Ekf2Selector(Ekf2SelectorConfig())
+    with pytest.raises(RuntimeError, match="estimate_0"):
+        selector.GetOutputPort("estimate").Eval(selector.CreateDefaultContext())
+
+
 def test_initial_state():
     selector = Ekf2Selector(Ekf2SelectorConfig())
     context = selector.CreateDefaultContext()
