@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from studies import figures
 from studies.study import Budget, Cell, Study
-from studies.summary import CONFIDENCE, mean, with_measures
+from studies.summary import CONFIDENCE, mean, show_rate, with_measures
 
 CM = 100.0  # in a metre; errors are told in cm, whatever they are
 RESAMPLES = 400  # of the pairs, for the interval of a budget
@@ -281,6 +281,31 @@ def table_lines(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -
     return lines
 
 
+def promise_lines(study: Study, summary: Mapping[str, Any]) -> list[str]:
+    """How often promises are kept, as tables of Markdown with their intervals."""
+    *outer, last = study.axes
+    labels = _labels(study)
+    lines = []
+    for promise in summary["promises"]:
+        shares = {
+            (row["variant"], *row["levels"].values()): show_rate(row["share"])
+            for row in promise["cells"]
+        }
+        for at in itertools.product(*(study.axes[axis].steps for axis in outer)):
+            where = _where(study, dict(zip(outer, at, strict=True)))
+            head = f"{promise['text']} ({where})" if where else promise["text"]
+            lines += [
+                f"| {head} | {' | '.join(labels.values())} |",
+                "|---|" + "---:|" * len(labels),
+            ]
+            for step, level in study.axes[last].steps.items():
+                entries = [shares.get((name, *at, step), "–") for name in labels]
+                if any(entry != "–" for entry in entries):
+                    lines.append(f"| {level.label or step} | {' | '.join(entries)} |")
+            lines.append("")
+    return lines
+
+
 def winners(
     study: Study,
     table: pd.DataFrame,
@@ -491,4 +516,6 @@ def markdown_lines(
         lines += [rule(budget) for budget in study.budgets]
     if study.layout == "table":
         lines += ["", *table_lines(study, table, summary)]
+    if study.promises:
+        lines += ["", *promise_lines(study, summary)]
     return [*lines, ""]

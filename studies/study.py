@@ -135,6 +135,16 @@ class Budget:
 
 
 @configuration
+class Promise:
+    """What touchdowns are held to; how often they keep it is told for every cell."""
+
+    within: Positive  # m
+    # target: of where it should have landed. first_level: of where the run of the same pair touched
+    # down at the first level of the last axis, that is undisturbed
+    of: Literal["target", "first_level"] = "target"
+
+
+@configuration
 class Measures:
     """Which columns of a run's result the summary is about."""
 
@@ -235,6 +245,7 @@ class Study:
     # over the last axis; table: variants beside each other over the last axis
     layout: Literal["maps", "curves", "table"] = "maps"
     budgets: list[Budget] = Field(default_factory=list)  # told in words, of a study with axes
+    promises: list[Promise] = Field(default_factory=list)  # counted, of a study with axes
 
     @model_validator(mode="after")
     def _unambiguous(self) -> "Study":
@@ -256,6 +267,8 @@ class Study:
         for budget in self.budgets:
             if budget.axis not in self.axes:
                 raise ValueError(f"budgets: there is no axis {budget.axis!r}")
+        if self.promises and not self.axes:
+            raise ValueError("promises: expected a study with axes")
         for (first, left), (second, right) in rivals:
             if common := sorted(left & right):
                 raise ValueError(f"{common[0]} is set by {first} and by {second}: expected one")

@@ -20,7 +20,7 @@ from scipy import stats
 
 from studies.ledger import write_durably
 from studies.published import INCONSISTENCIES, PUBLISHED, SIGNIFICANCE, Comparison, compare, holm
-from studies.study import Condition, Study
+from studies.study import Condition, Promise, Study
 
 CONFIDENCE = 0.95  # of all intervals
 BOOTSTRAP_RESAMPLES = 1999
@@ -65,6 +65,10 @@ def summarise(study: Study, table: pd.DataFrame, runs: int, folder: Path) -> dic
             for condition in study.conditions
         ],
         "paired": [] if study.axes else _paired(study, landed),  # maps compare by cell
+        "promises": [
+            {"text": promise_text(promise), "cells": _kept(study, table, promise)}
+            for promise in study.promises
+        ],
         "published": [
             dataclasses.asdict(comparison)
             | {"agrees": comparison.agrees, "verdict": comparison.verdict}
@@ -200,6 +204,37 @@ def published_trials(study: Study, condition: Condition) -> Any:
     return PUBLISHED[variant.published] if variant and variant.published else None
 
 
+def promise_text(promise: Promise) -> str:
+    """A promise in words."""
+    where = "" if promise.of == "target" else " of the undisturbed touchdown"
+    return f"within {promise.within * 100.0:g} cm{where}"
+
+
+def _kept(study: Study, table: pd.DataFrame, promise: Promise) -> list[dict[str, Any]]:
+    """The share of each cell's runs that keep a promise; one that does not succeed breaks it."""
+    measures = study.measures
+
+    def touchdowns(condition: Condition) -> pd.DataFrame:
+        runs = table[table["condition"].eq(condition.label)].set_index("pair")
+        return runs[[measures.x, measures.y]].where(runs[measures.success].eq(True), math.nan)
+
+    cells = {(cell.variant, *cell.levels.values()): cell for cell in study.cells}
+    first = next(iter(list(study.axes.values())[-1].steps))
+    found = []
+    for (*row, level), cell in cells.items():
+        distance = touchdowns(cell.condition)
+        if promise.of == "first_level":
+            if level == first or (*row, first) not in cells:
+                continue
+            twins = touchdowns(cells[*row, first].condition)
+            distance = (distance - twins).loc[distance.index.intersection(twins.index)]
+        kept = int((np.hypot(*distance.to_numpy().T) <= promise.within).sum())
+        share = rate(kept, len(distance))
+        row_of = {"condition": cell.condition.label, "variant": cell.variant}
+        found.append({**row_of, "levels": cell.levels, "share": share})
+    return found
+
+
 def quantity(column: str, values: ArrayLike) -> tuple[str, str, float]:
     """The title, unit and scale under which people read a column."""
     for suffix, unit, scale in (
@@ -270,6 +305,10 @@ def markdown(study: Study, summary: Mapping[str, Any]) -> str:
             )
             for row in summary["paired"]
         ]
+    for promise in summary["promises"]:
+        lines += ["", f"## {_heading(promise['text'])}", "", _row(["condition", "kept"])]
+        lines += [_row(["---", "---:"])]
+        lines += [_row([row["condition"], show_rate(row["share"])]) for row in promise["cells"]]
     if summary["published"]:
         lines += ["", "## Against the published trials", "", agreement(summary), ""]
         lines += [

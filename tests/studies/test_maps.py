@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from studies import figures, maps, pages
 from studies.campaign import run_study
 from studies.report import write_report
-from studies.study import Axis, Budget, Level, Study, Variant
+from studies.study import Axis, Budget, Level, Promise, Study, Variant
 from studies.summary import summarise
 
 PAIRS = 60
@@ -256,6 +257,35 @@ def test_a_study_without_variants_is_shown_by_its_scenario(layout, monkeypatch, 
     assert "toy" in text
     assert maps.sentences(study, table)[0].startswith("**toy**, 10 cm over *latency*")
     assert maps.table_lines(study, table, summary)[0] == "| latency (gate 1) | toy |"
+
+
+def test_promises_are_counted_of_the_target_and_of_the_undisturbed_twin(study, tmp_path: Path):
+    study = dataclasses.replace(
+        study,
+        layout="table",
+        promises=[Promise(within=0.15), Promise(within=0.1, of="first_level")],
+    )
+    table = landings(study)
+    summary = summarise(study, table, len(table), tmp_path)
+    of_target, of_twin = (
+        {(row["variant"], *row["levels"].values()): row["share"] for row in promise["cells"]}
+        for promise in summary["promises"]
+    )
+    runs = table[table["variant"].eq("ignored") & table["condition"].str.endswith("100")]
+    kept = (runs["landing_error_m"] <= 0.15).mean()
+    assert of_target["ignored", "2", "100"]["value"] == pytest.approx(kept)
+    # 0.8 mm a ms: moved by 8 cm at 100 ms and by 16 at 200; beyond 300 ms half do not land
+    assert ("ignored", "1", "0") not in of_twin
+    assert of_twin["ignored", "1", "100"]["value"] == 1.0
+    assert of_twin["ignored", "1", "200"]["value"] == 0.0
+    assert of_twin["stamped", "1", "400"]["value"] == 1.0
+    wide = dataclasses.replace(study, promises=[Promise(within=1.0, of="first_level")])
+    (promise,) = summarise(wide, table, len(table), tmp_path)["promises"]
+    shares = {(row["variant"], row["levels"]["latency"]): row["share"] for row in promise["cells"]}
+    assert shares["ignored", "400"]["value"] == 0.5
+    lines = maps.promise_lines(study, summary)
+    assert lines[0] == "| within 15 cm (light 1) | Ignored | Time stamps |"
+    assert any(line.startswith("| within 10 cm of the undisturbed touchdown") for line in lines)
 
 
 def test_the_report_tells_cells_and_budgets(study, flown):

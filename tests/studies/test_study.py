@@ -334,6 +334,7 @@ def test_cells_can_be_left_out(mapped: Study):
         ("axes: {a: {values: [1], paths: {w: 1}}}\ngrids: {w: [1]}", "w is set by axes.a and by"),
         ("axes: {a: {values: [1], paths: {w: 1}, without: [x]}}", "axes.a: there is no variant"),
         ("budgets: [{axis: x}]", "budgets: there is no axis 'x'"),
+        ("promises: [{within: 0.1}]", "promises: expected a study with axes"),
     ],
 )
 def test_wrong_axes_are_refused_in_one_sentence(tmp_path: Path, text: str, expected: str):
