@@ -47,6 +47,7 @@ MEASUREMENTS = (
     "marker",
     "infrared",
     "svgs",
+    "pad_gnss",
 )
 
 
@@ -201,6 +202,7 @@ class LandingDiagram:
             "rotor_commands": ([f"rotor_{i + 1}" for i in rotors], slow),
             "touchdown": (TOUCHDOWN, slow),
             "gnss": (GNSS, slow),
+            "pad_gnss": (GNSS, slow),
             "barometer": (BAROMETER, slow),
             "magnetometer": (MAGNETOMETER, slow),
             "marker": (MARKER, slow),

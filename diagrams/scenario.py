@@ -98,8 +98,20 @@ class SvgsCameraChannel:
 
 
 @configuration
+class PadGnssChannel:
+    """A GNSS receiver on the pad, and its way to the vehicle by radio."""
+
+    sensor: GnssConfig = Field(default_factory=GnssConfig)
+    faults: FaultInjectorConfig | None = None  # null: no injector, and no commands to it
+    # s; the receiver's 0.11, and half of a SiK radio's turn (MAX_WINDOW, 131 ms) on the way
+    latency: DelayLineConfig = Field(
+        default_factory=lambda: DelayLineConfig(processing=0.11, transport=0.065, period=0.04)
+    )
+
+
+@configuration
 class Sensors:
-    """Every sensor on board; a channel that is null is not there."""
+    """Every sensor on board, and the pad's receiver; a channel that is null is not there."""
 
     imu: ImuConfig = Field(default_factory=ImuConfig)
     imu_2: ImuConfig | None = None  # for a second navigation filter, see `selector`
@@ -111,6 +123,7 @@ class Sensors:
     marker_camera: MarkerCameraChannel | None = Field(default_factory=MarkerCameraChannel)
     infrared_camera: InfraredCameraChannel | None = Field(default_factory=InfraredCameraChannel)
     svgs_camera: SvgsCameraChannel | None = None
+    pad_gnss: PadGnssChannel | None = None
 
 
 LandingTargetConfig = Annotated[
@@ -204,6 +217,7 @@ def _shared(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
         ("touchdown.time_limit", s.time_limit, "time_limit"),
         ("navigation.origin", origin, "origin"),
         ("sensors.gnss.sensor.origin", origin, "origin"),
+        ("sensors.pad_gnss.sensor.origin", origin, "origin"),
         ("sensors.barometer.origin_altitude", s.origin.altitude, "origin.altitude"),
         ("sensors.barometer.vehicle_mass", vehicle.mass, "vehicle"),
     ]
@@ -222,11 +236,18 @@ def _shared(s: MultirotorLanding) -> list[tuple[str, Any, str]]:
     if s.sensors.svgs_camera is not None:
         sensor, node = "sensors.svgs_camera.sensor", "landing_target.transformations"
         shared.append((f"{sensor}.fidelity", s.fidelity, "fidelity"))
+        phone = s.sensors.svgs_camera.sensor
+        if isinstance(s.landing_target, MultiHypothesisTargetConfig):
+            front_end = "landing_target.front_end"
+            shared.append((f"{front_end}.beacons", phone.beacons, f"{sensor}.beacons"))
+            shared.append((f"{front_end}.svgs_position", phone.position, f"{sensor}.position"))
+            shared.append((f"{front_end}.svgs_yaw", phone.yaw, f"{sensor}.yaw"))
         if isinstance(s.landing_target, SvgsCompanionConfig):
-            phone = s.sensors.svgs_camera.sensor
             shared.append((f"{node}.beacons", phone.beacons, f"{sensor}.beacons"))
             shared.append((f"{node}.camera_position", phone.position, f"{sensor}.position"))
             shared.append((f"{node}.camera_yaw", phone.yaw, f"{sensor}.yaw"))
+    if isinstance(s.landing_target, MultiHypothesisTargetConfig):
+        shared.append(("landing_target.front_end.origin", origin, "origin"))
     if isinstance(s.landing_target, SvgsCompanionConfig):
         return shared  # the other estimators' front end listens to the other sensors
     if s.sensors.range_finder is not None:

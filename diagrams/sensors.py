@@ -1,5 +1,7 @@
 """Every sensor as one named diagram: sensor, then injected faults if any, then latency."""
 
+from typing import Any
+
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
 from diagrams.blocks import Blocks
@@ -15,11 +17,14 @@ from systems.signals.measurement import (
     Layout,
 )
 
-# Name of the channel, path in the scenario, layout: sensors with faults and latency behind them.
-CAMERAS = (
-    ("marker", "sensors.marker_camera", MARKER),
-    ("infrared", "sensors.infrared_camera", INFRARED),
-    ("svgs", "sensors.svgs_camera", SVGS),
+# Name of the channel, path in the scenario, layout, options of the sensor: those with faults and
+# latency behind them.
+CHANNELS: tuple[tuple[str, str, Layout, dict[str, Any]], ...] = (
+    ("gnss", "sensors.gnss", GNSS, {}),
+    ("marker", "sensors.marker_camera", MARKER, {}),
+    ("infrared", "sensors.infrared_camera", INFRARED, {}),
+    ("svgs", "sensors.svgs_camera", SVGS, {}),
+    ("pad_gnss", "sensors.pad_gnss", GNSS, {"carrier": "pad"}),
 )
 DIRECT = ("imu", "imu_2", "imu_3", "barometer", "magnetometer", "range_finder")
 
@@ -29,7 +34,7 @@ def sensors(blocks: Blocks) -> Diagram:
 
     Exports the inputs `body`, `pad`, `supervisor`, `fault_command` and one output a
     sensor that the scenario has: `imu`, `imu_2`, `imu_3`, `gnss`, `barometer`,
-    `magnetometer`, `range_finder`, `marker`, `infrared`, `svgs`.
+    `magnetometer`, `range_finder`, `marker`, `infrared`, `svgs`, `pad_gnss`.
     """
     builder = DiagramBuilder()
     shared = _SharedInputs(builder)
@@ -38,22 +43,13 @@ def sensors(blocks: Blocks) -> Diagram:
         if sensor is not None:
             shared.connect(sensor)
             builder.ExportOutput(sensor.GetOutputPort("measurement"), name)
-    gnss = blocks.add(builder, "sensors.gnss.sensor", "gnss")
-    if gnss is not None:
-        shared.connect(gnss)
-        port = gnss.GetOutputPort("measurement")
-        faults = blocks.add(builder, "sensors.gnss.faults", "gnss faults", layout=GNSS)
-        if faults is not None:
-            builder.Connect(port, faults.GetInputPort("measurement"))
-            shared.connect(faults)
-            port = faults.GetOutputPort("measurement")
-        builder.ExportOutput(_delayed(builder, blocks, "gnss", "sensors.gnss", GNSS, port), "gnss")
-    for name, path, layout in CAMERAS:
-        camera = blocks.add(builder, f"{path}.sensor", f"{name} camera")
-        if camera is None:
+    for name, path, layout, options in CHANNELS:
+        called = name if layout is GNSS else f"{name} camera"
+        sensor = blocks.add(builder, f"{path}.sensor", called, **options)
+        if sensor is None:
             continue
-        shared.connect(camera)
-        port = camera.GetOutputPort("measurement")
+        shared.connect(sensor)
+        port = sensor.GetOutputPort("measurement")
         faults = blocks.add(builder, f"{path}.faults", f"{name} faults", layout=layout)
         if faults is not None:
             builder.Connect(port, faults.GetInputPort("measurement"))

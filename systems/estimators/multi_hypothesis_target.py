@@ -13,6 +13,7 @@ from pydrake.systems.framework import (
 )
 from scipy.stats import chi2
 
+from plants.svgs_beacons import SvgsBeaconsConfig
 from systems.configuration import (
     Finite,
     Metres,
@@ -31,12 +32,15 @@ from systems.estimators.multi_hypothesis_target_kernel import (
     HYPOTHESES,
     MEMORY,
     PARAMETERS,
+    SVGS_SOURCE,
     TARGET_HYPOTHESES,
 )
 from systems.signals.measurement import (
+    GNSS,
     INFRARED,
     MARKER,
     RANGE_FINDER,
+    SVGS,
     TARGET_MEASUREMENT,
     VEHICLE_ESTIMATE,
     no_measurement,
@@ -48,6 +52,8 @@ _SOURCES = {
     "infrared": INFRARED_SOURCE,
     "marker": MARKER_SOURCE,
     "fused": INFRARED_SOURCE | MARKER_SOURCE,
+    "svgs": SVGS_SOURCE,
+    "all": INFRARED_SOURCE | MARKER_SOURCE | SVGS_SOURCE,
 }
 
 
@@ -55,11 +61,14 @@ _SOURCES = {
 class TargetSensorsConfig:
     """Which sensors are listened to, where they sit and how well they measure."""
 
-    mode: Literal["infrared", "marker", "fused"] = "fused"
+    mode: Literal["infrared", "marker", "fused", "svgs", "all"] = "fused"
     infrared_position: Vector3 = Field(default_factory=lambda: [0.0, 0.0, -0.05])  # m, p_BC
     infrared_yaw: Finite = 0.0  # rad, turn of the camera about z_B
     marker_position: Vector3 = Field(default_factory=lambda: [0.0, 0.0, -0.05])  # m, p_BC
     marker_yaw: Finite = 0.0  # rad
+    svgs_position: Vector3 = Field(default_factory=lambda: [0.0, 0.0, -0.05])  # m, p_BC
+    svgs_yaw: Finite = 0.0  # rad
+    beacons: SvgsBeaconsConfig = Field(default_factory=SvgsBeaconsConfig)  # what SVGS looks for
     range_finder_position: Vector3 = Field(default_factory=lambda: [0.0, 0.0, 0.0])  # m, p_BR
     infrared_angle_noise: Positive = 1.5e-3  # rad, half a pixel of 3 mrad, one sigma
     infrared_lamp_noise: Positive = 0.01  # m, half the lamp's radius
@@ -68,6 +77,11 @@ class TargetSensorsConfig:
     range_noise: Positive = 0.05  # m, TFmini Plus up to 6 m; its constant part counts as noise
     ground_noise: Positive = 0.3  # m, of the pad's top over the ground that the beam hits beside it
     pad_radius: Metres = 0.4  # m, within which the beam surely meets the pad
+    # m, one sigma an axis by which the place of the pad by its receiver and that of the vehicle by
+    # its own are apart, unless both have fixed ambiguities: √2 · 2.5 m CEP / 1.1774, two NEO-M8
+    gnss_error: Positive = 3.0
+    # deg, deg, m: latitude, longitude and altitude of W's origin
+    origin: Vector3 = Field(default_factory=lambda: [39.3622, 22.9420, 10.0])
 
 
 @configuration
@@ -95,9 +109,11 @@ class MultiHypothesisTargetConfig:
     late_probability: Probability = 1e-3  # that a target seen after the first one is the pad
     marker_odds: Positive = 6.9  # 1, log of the odds that a marker measurement adds: of 1000 codes
     marker_time: Seconds = 0.5  # s, within which two measurements are not independent
-    marker_odds_limit: Positive = 12.0  # 1, and no more than this
+    marker_odds_limit: Positive = 12.0  # 1, the log of the odds itself grows no further
     known_radius: Positive = 1.0  # m, one sigma in a second from now, to which a place is known
+    known_slope: NonNegative = 0.05  # 1, or to so much of the height above it
     forget_radius: Positive = 3.0  # m, one sigma, at which a hypothesis says nothing any more
+    forget_slope: NonNegative = 0.15  # 1, or so much of the height above it
     forget_time: Seconds = 10.0  # s, by which another must have been seen longer to remain alone
 
     def add_to(self, builder: DiagramBuilder, name: str, seed: int = 0) -> "MultiHypothesisTarget":
@@ -113,6 +129,9 @@ class MultiHypothesisTarget(LeafSystem):
         input_ports:
         - infrared (optional)
         - marker (optional)
+        - svgs (optional)
+        - gnss (optional)
+        - pad_gnss (optional)
         - range_finder (optional)
         - estimate
         output_ports:
@@ -124,6 +143,9 @@ class MultiHypothesisTarget(LeafSystem):
     |---|---|---|
     | `infrared` (optional) | `INFRARED` | every blob may be the beacon; unconnected: none |
     | `marker` (optional) | `MARKER` | the detected marker; unconnected: none |
+    | `svgs` (optional) | `SVGS` | the pose of a light beacon; unconnected: none |
+    | `gnss` (optional) | `GNSS` | the vehicle's receiver, of use with the pad's alone |
+    | `pad_gnss` (optional) | `GNSS` | the pad's own receiver, by radio; unconnected: none |
     | `range_finder` (optional) | `RANGE_FINDER` | the pad's height; unconnected: from the marker |
     | `estimate` | `VEHICLE_ESTIMATE` | the vehicle, whose GNSS receiver is in it |
     | `target` | `TARGET_ESTIMATE` | the most probable hypothesis now |
@@ -147,19 +169,27 @@ class MultiHypothesisTarget(LeafSystem):
     of validity (interpolated in a memory of 2 s), h the height above the pad:
 
         marker      p_BP_W = p − p_OB + h (b, 0)                              three rows
+        SVGS        the same, p_BP_W from the beacon's pose and its place on the pad
         infrared    0 = (p − p_OC)_xy − (d_xy/d_z)(p − p_OC)_z + h b          two rows a blob
         range       p_z = p_OB.z − height, less certain where the beam misses the pad
+        pad's GNSS  p_WP − p_WB = p − p_OB by the two receivers, horizontally   two rows
+                    v_WP = v, with the odometry's drift_speed                 three rows
 
-    d is the blob's ray in W. Latency needs no parameter. A measurement that comes after a younger
-    one is put in its place among the last 48, and all behind it are filtered anew: exactly the
-    filter that had them in order (Bar-Shalom, "Update with out-of-sequence measurements in
-    tracking: exact solution", IEEE T-AES 38(3), 2002, section II, gives re-processing as the
-    reference). For one older than these some estimates x_k are kept as they leave, every 0.1 s,
-    with C_k = cov(e, e_k), which follows the filter, C_k ← (I − K H) F C_k (the product of
-    gains in Larsen et al., "Incorporation of time delayed measurements in a discrete-time
-    Kalman filter", CDC 1998). Predicted to the measurement's time x_k gives the innovation
-    ν, and the oldest estimate is corrected by C_k Hᵀ S⁻¹ ν: the best use of ν, with its true
-    covariance, though x_k knows less than what was fused since.
+    d is the blob's ray in W. The receivers' positions differ by `gnss_error` for long, so without
+    fixed ambiguities on both sides they are fused only while less is known, and begin nothing;
+    with them (fix type 6) they are a sighting like the marker's: they begin hypotheses, count as
+    evidence, and a pad that no camera sees is landed on.
+
+    Latency needs no parameter. A measurement that comes after a younger one is put in its place
+    among the last 48, and all behind it are filtered anew: exactly the filter that had them in
+    order (Bar-Shalom, "Update with out-of-sequence measurements in tracking: exact solution", IEEE
+    T-AES 38(3), 2002, section II, gives re-processing as the reference). For one older than these
+    some estimates x_k are kept as they leave, every 0.1 s, with C_k = cov(e, e_k), which follows
+    the filter, C_k ← (I − K H) F C_k (the product of gains in Larsen et al., "Incorporation of
+    time delayed measurements in a discrete-time Kalman filter", CDC 1998). Predicted to the
+    measurement's time x_k gives the innovation ν, and the oldest estimate is corrected by
+    C_k Hᵀ S⁻¹ ν: the best use of ν, with its true covariance, though x_k knows less than what was
+    fused since.
     What is older than the memory of poses is not used. A constant error of the time stamps
     themselves is not estimated: without a motion that the vehicle makes on purpose it
     cannot be told from b.
@@ -174,7 +204,7 @@ class MultiHypothesisTarget(LeafSystem):
     rival that has to win by evidence,
 
         ln odds = (first: 0; later: ln late_probability)
-                  + min(Σ marker_odds (1 − e^(−Δt/marker_time)), limit)
+                  + Σ marker_odds (1 − e^(−Δt/marker_time)),            limited
 
     over the marker measurements that belong to it, less those that belonged elsewhere while
     nothing was seen of it: the marker's code tells the pad from a lamp, and what follows the
@@ -205,12 +235,17 @@ class MultiHypothesisTarget(LeafSystem):
             declare("infrared", INFRARED.size), no_measurement(INFRARED)
         )
         self._marker = optional_input(declare("marker", MARKER.size), no_measurement(MARKER))
+        self._svgs = optional_input(declare("svgs", SVGS.size), no_measurement(SVGS))
+        self._gnss = optional_input(declare("gnss", GNSS.size), no_measurement(GNSS))
+        self._pad_gnss = optional_input(declare("pad_gnss", GNSS.size), no_measurement(GNSS))
         self._range_finder = optional_input(
             declare("range_finder", RANGE_FINDER.size), no_measurement(RANGE_FINDER)
         )
         self._estimate = declare("estimate", VEHICLE_ESTIMATE.size).Eval
         memory = MEMORY(MEMORY.zeros())
         memory.infrared_arrival = memory.marker_arrival = memory.range_arrival = -1.0
+        memory.svgs_arrival = memory.pad_gnss_arrival = memory.pad_gnss_fused = -1.0
+        memory.gnss_arrival = memory.fix_time = -1.0
         memory.code_seen = -np.inf
         tracks = np.zeros((HYPOTHESES, TRACK))
         tracks[:, BORN] = -1.0
@@ -238,18 +273,22 @@ class MultiHypothesisTarget(LeafSystem):
         k.bias_time_at_rest = k.bias_time_moving = c.bearing_bias_time
         k.sources = _SOURCES[s.mode]
         for name in ("infrared_angle_noise", "infrared_lamp_noise", "marker_noise",
-                     "attitude_noise", "range_noise", "ground_noise", "pad_radius"):  # fmt: skip
+                     "attitude_noise", "range_noise", "ground_noise", "pad_radius",
+                     "gnss_error"):  # fmt: skip
             setattr(k, name, getattr(s, name))
         for name in ("drift_speed", "initial_radius", "initial_speed", "marker_odds", "marker_time",
-                     "marker_odds_limit", "known_radius", "forget_radius",
-                     "forget_time"):  # fmt: skip
+                     "marker_odds_limit", "known_radius", "known_slope", "forget_radius",
+                     "forget_slope", "forget_time"):  # fmt: skip
             setattr(k, name, getattr(c, name))
         k.gate_2, k.gate_3 = chi2.ppf(c.gate_probability, (2, 3))
         k.late_odds = float(np.log(c.late_probability))
+        k.latitude, k.longitude, k.altitude = s.origin
         self._parameters = k[:]
         self._parameters[PARAMETERS.slice("range_finder")] = s.range_finder_position
         self._X_BI = camera_mount(s.infrared_position, s.infrared_yaw)
         self._X_BM = camera_mount(s.marker_position, s.marker_yaw)
+        self._X_BS = camera_mount(s.svgs_position, s.svgs_yaw)
+        self._placements = s.beacons.placements()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         kernel.poll(
@@ -261,9 +300,14 @@ class MultiHypothesisTarget(LeafSystem):
             context.get_time(),
             self._infrared(context),
             self._marker(context),
+            self._svgs(context),
+            self._gnss(context),
+            self._pad_gnss(context),
             self._range_finder(context),
             self._estimate(context),
             self._parameters,
             self._X_BI,
             self._X_BM,
+            self._X_BS,
+            self._placements,
         )

@@ -7,8 +7,8 @@ answer is that of a filter that was given everything in order. Of what falls out
 estimates are kept, with the covariance of their errors and those of the oldest slot, so that an
 even older measurement can still be fused there.
 
-A measurement is at most three rows that are linear in the pad's position p and the bearing bias b,
-whitened: value = h_p · p + h_b · b + N(0, 1). It may say that the pad's velocity has changed at
+A measurement is at most three rows that are linear in the state, whitened:
+value = h · x + N(0, 1). It may say that the pad's velocity has changed at
 once some time before: a kick.
 """
 
@@ -19,7 +19,7 @@ from numba import njit
 
 STATES = 8  # p (m), v (m/s) by odometry; b (rad)
 _PACKED = STATES * (STATES + 1) // 2
-ROW = 6  # coefficients of p (3) and b (2), value
+ROW = STATES + 1  # coefficients, value
 ROWS = 3
 
 # The header of a track.
@@ -182,12 +182,9 @@ def _reach(x, P, dt, observation, noise):
 def _row(observation, row, h):
     """Write the coefficients of a row over the state into h (8,); returns its value."""
     start = _FIRST_ROW + row * ROW
-    h[:] = 0.0
-    for i in range(3):
+    for i in range(STATES):
         h[i] = observation[start + i]
-    h[6] = observation[start + 3]
-    h[7] = observation[start + 4]
-    return observation[start + 5]
+    return observation[start + STATES]
 
 
 @njit(cache=True)
@@ -456,7 +453,7 @@ def _refilter(track, first, x, P, noise):
 
 @njit(cache=True)
 def whiten(observation, time, H, values, R, count):
-    """Write a measurement of `count` rows: values = H (p, b) + N(0, R).
+    """Write a measurement of `count` rows: values = H x + N(0, R).
 
     Parameters
     ----------
@@ -464,7 +461,7 @@ def whiten(observation, time, H, values, R, count):
         Overwritten.
     time : float
         s, of validity.
-    H : array of shape (3, 5)
+    H : array of shape (3, 8)
     values : array of shape (3,)
     R : array of shape (3, 3)
         Positive definite in its first `count` rows; changed in place (its Cholesky factor).
@@ -481,7 +478,7 @@ def whiten(observation, time, H, values, R, count):
             R[i, j] = math.sqrt(total) if i == j else total / R[j, j]
         row = _FIRST_ROW + i * ROW
         for c in range(ROW):
-            value = H[i, c] if c < 5 else values[i]
+            value = H[i, c] if c < STATES else values[i]
             for k in range(i):
                 value -= R[i, k] * observation[_FIRST_ROW + k * ROW + c]
             observation[row + c] = value / R[i, i]

@@ -18,17 +18,23 @@ from systems.estimators.multi_hypothesis_target_filter import (
     NOISE,
     OBSERVATION,
     PRIOR,
+    ROW_COUNT,
     SEEN,
     SINCE,
     STATES,
     TIME,
 )
+from systems.estimators.svgs_companion_transformations import SVGS_SOURCE as _SVGS_BIT
+from systems.estimators.svgs_companion_transformations import pad_from_pose
 from systems.frames import rotation_matrix
+from systems.geodesy import world_from_geodetic
 from systems.signals.measurement import (
+    GNSS,
     INFRARED,
     INFRARED_BLOBS,
     RANGE_FINDER,
     SEQUENCE_NUMBER,
+    SVGS,
     TARGET_ESTIMATE,
     TARGET_MEASUREMENT,
     TIME_OF_ARRIVAL,
@@ -36,8 +42,11 @@ from systems.signals.measurement import (
     VALID,
     VEHICLE_ESTIMATE,
     Layout,
+    vector,
 )
 from systems.vision.planar_pose import pad_position_from_marker
+
+SVGS_SOURCE = int(_SVGS_BIT)
 
 PARAMETERS = Layout(
     "MultiHypothesisTargetParameters",
@@ -74,11 +83,18 @@ PARAMETERS = Layout(
         "marker_time",  # s, within which two of them tell the same
         "marker_odds_limit",  # 1
         "known_radius",  # m
+        "known_slope",  # 1
         "forget_radius",  # m
+        "forget_slope",  # 1
         "forget_time",  # s
         "range_finder_x",  # m, in B
         "range_finder_y",
         "range_finder_z",
+        "gnss_error",  # m, of the difference of two receivers, unless both have fixed ambiguities
+        "latitude",  # deg, of W's origin
+        "longitude",  # deg
+        "altitude",  # m
+        "odometry_z",  # m, of the vehicle now
     ),
 )
 POSES = 128  # polls that are remembered, 2 s
@@ -89,6 +105,14 @@ MEMORY = Layout(
         "infrared_arrival",  # s, of the newest measurement taken
         "marker_arrival",
         "range_arrival",
+        "svgs_arrival",
+        "pad_gnss_arrival",
+        "pad_gnss_fused",  # s, validity of the newest one fused; -1 none
+        "gnss_arrival",
+        "fix_time",  # s, validity of the vehicle's own newest fix; -1 none
+        *vector("fix"),  # m, from the odometry's origin to W's, by that fix
+        *vector("fix_variance"),  # m2
+        "fix_type",  # as in `GNSS`
         "polls",  # so far
         "range_polls",  # polls since a range was taken
         "code_seen",  # s, validity of the newest marker measurement that was evidence
@@ -123,17 +147,18 @@ _GATE_2, _GATE_3 = _i("gate_2"), _i("gate_3")
 _LATE, _MARKER_ODDS, _ODDS_LIMIT = _i("late_odds"), _i("marker_odds"), _i("marker_odds_limit")
 _MARKER_TIME, _DRIFT_SPEED = _i("marker_time"), _i("drift_speed")
 _KNOWN, _FORGET_RADIUS, _FORGET = _i("known_radius"), _i("forget_radius"), _i("forget_time")
-_ARM = _i("range_finder_x")
+_KNOWN_SLOPE, _FORGET_SLOPE = _i("known_slope"), _i("forget_slope")
+_ARM, _GNSS_ERROR, _ORIGIN = _i("range_finder_x"), _i("gnss_error"), _i("latitude")
+_HERE = _i("odometry_z")
 
-(
-    _IR_ARRIVAL,
-    _MARKER_ARRIVAL,
-    _RANGE_ARRIVAL,
-    _POLLS,
-    _RANGE_POLLS,
-    _CODE_SEEN,
-    _RING,
-) = range(7)
+_m = MEMORY.index
+_IR_ARRIVAL, _MARKER_ARRIVAL = _m("infrared_arrival"), _m("marker_arrival")
+_RANGE_ARRIVAL, _SVGS_ARRIVAL = _m("range_arrival"), _m("svgs_arrival")
+_PAD_GNSS_ARRIVAL, _PAD_GNSS_FUSED = _m("pad_gnss_arrival"), _m("pad_gnss_fused")
+_GNSS_ARRIVAL, _FIX_TIME, _FIX_X = _m("gnss_arrival"), _m("fix_time"), _m("fix_x")
+_FIX_VARIANCE, _FIX_TYPE = _m("fix_variance_x"), _m("fix_type")
+_POLLS, _RANGE_POLLS, _CODE_SEEN = _m("polls"), _m("range_polls"), _m("code_seen")
+_RING = _m("pose_0_0")
 _RANGE_EVERY = 4  # polls, so that ranges do not crowd the slots
 _MERGE_DISTANCE = 0.25  # m, hypotheses closer than this are the same pad
 _AHEAD = 1.0  # s, in which the vehicle answers: so long the place must stay known
@@ -150,6 +175,12 @@ _E_V = VEHICLE_ESTIMATE.index("v_WB_x")
 _E_HEIGHT = VEHICLE_ESTIMATE.index("height_above_ground")
 _E_HEIGHT_VALID = VEHICLE_ESTIMATE.index("height_above_ground_valid")
 _RANGE = RANGE_FINDER.index("range")
+_BEACON = SVGS.index("beacon")
+_LATITUDE, _GNSS_V = GNSS.index("latitude"), GNSS.index("v_W_x")
+_H_ACCURACY, _V_ACCURACY = GNSS.index("horizontal_accuracy"), GNSS.index("vertical_accuracy")
+_SPEED_ACCURACY, _FIX = GNSS.index("speed_accuracy"), GNSS.index("fix_type")
+_RTK_FIXED = 6.0
+_FIX_OLD = 2.0  # s, at which the vehicle's own fix is no base for the pad's any more
 _COUNT_BLOBS = INFRARED.index("count")
 _BLOB = INFRARED.index("blob_0_x")
 _M_P = TARGET_MEASUREMENT.index("p_BP_W_x")
@@ -219,23 +250,36 @@ def _pose_at(memory, time, p, q):
 
 @njit(cache=True)
 def observe_marker(observation, time, marker, p_OB, q_WB, X_BC, parameters):
-    """Write a marker measurement: all of p, and the bearing's bias at its height.
-
-    Returns p_BP_W and its covariance, shape (9,).
-    """
+    """Write a marker measurement; returns p_BP_W and its covariance, shape (9,)."""
     found = pad_position_from_marker(marker, q_WB, X_BC)
-    height = -found[2]
     noise = parameters[_MARKER_NOISE] ** 2
-    lateral = noise + (height * parameters[_ATTITUDE]) ** 2
+    lateral = noise + (found[2] * parameters[_ATTITUDE]) ** 2
     found[3] += lateral
     found[5] += lateral
     found[8] += noise
-    H = np.zeros((3, 5))
+    _observe_place(observation, time, found, p_OB)
+    return found
+
+
+@njit(cache=True)
+def observe_svgs(observation, time, pose, p_OB, q_WB, X_BC, placements, parameters):
+    """Write the pose of an SVGS beacon; returns p_BP_W and its covariance, shape (9,)."""
+    found = np.empty(9)
+    pad_from_pose(pose, q_WB, X_BC, placements, parameters[_ATTITUDE], False, found)
+    _observe_place(observation, time, found, p_OB)
+    return found
+
+
+@njit(cache=True)
+def _observe_place(observation, time, found, p_OB):
+    """Write p_BP_W and its covariance: all of p, and the bearing's bias at its height."""
+    height = -found[2]
+    H = np.zeros((3, STATES))
     values = np.empty(3)
     for i in range(3):
         H[i, i] = 1.0
         values[i] = p_OB[i] + found[i]
-    H[0, 3] = H[1, 4] = height
+    H[0, 6] = H[1, 7] = height
     R = np.array(
         [
             [found[3], found[4], found[6]],
@@ -244,7 +288,6 @@ def observe_marker(observation, time, marker, p_OB, q_WB, X_BC, parameters):
         ]
     )
     track_filter.whiten(observation, time, H, values, R, 3)
-    return found
 
 
 @njit(cache=True)
@@ -267,14 +310,14 @@ def observe_blob(observation, time, x, y, height, p_OB, q_WB, X_BC, parameters):
     s = -(max(height, 0.05) + arm[2]) / d[2]
     if s <= 0.0:
         return found
-    H = np.zeros((3, 5))
+    H = np.zeros((3, STATES))
     values = np.zeros(3)
     J = np.empty((2, 2))
     for i in range(2):
         slope = d[i] / d[2]
         H[i, i] = 1.0
         H[i, 2] = -slope
-        H[i, 3 + i] = height
+        H[i, 6 + i] = height
         values[i] = p_OB[i] + arm[i] - slope * (p_OB[2] + arm[2])
         J[i, 0] = s * (R_WC[i, 0] - slope * R_WC[2, 0])
         J[i, 1] = s * (R_WC[i, 1] - slope * R_WC[2, 1])
@@ -301,7 +344,7 @@ def observe_range(observation, time, ranging, p_OB, q_WB, off_pad, parameters):
     noise = parameters[_RANGE_NOISE] ** 2
     if off_pad:
         noise += parameters[_GROUND_NOISE] ** 2
-    H = np.zeros((3, 5))
+    H = np.zeros((3, STATES))
     H[0, 2] = 1.0
     values = np.zeros(3)
     values[0] = p_OB[2] - height
@@ -369,13 +412,17 @@ def _associate(tracks, observation, gate, taken, named, x, P, parameters):
 
 @njit(cache=True)
 def _known(track, t, x, P, parameters):
-    """Whether the place of a track is known for a while; x and P are its estimate at t (s)."""
+    """Whether the place of a track is known for a while; x and P are its estimate at t (s).
+
+    From high up less need be known.
+    """
     track_filter.newest(track, t, x, P, _noise(track, parameters))
     ahead = 0.0
     for i in range(2):
         spread = P[i, i] + _AHEAD * (2.0 * P[i, 3 + i] + _AHEAD * P[3 + i, 3 + i])
         ahead = max(ahead, spread)
-    return ahead <= parameters[_KNOWN] ** 2
+    enough = max(parameters[_KNOWN], parameters[_KNOWN_SLOPE] * (parameters[_HERE] - x[2]))
+    return ahead <= enough * enough
 
 
 @njit(cache=True)
@@ -416,16 +463,19 @@ def _begin(tracks, t, time, found, p_OB, height_sigma, parameters, x, P):
 
 @njit(cache=True)
 def _take(track, observation, t, x, P, parameters):
-    """Fuse a camera's measurement into a track at time t; see whether it moves.
-
-    It does if its velocity is not explained by the odometry's, drift_speed.
-    """
+    """Fuse a sighting into a track at time t."""
     noise = _noise(track, parameters)
     track_filter.insert(track, observation, x, P, noise)
     track[FUSED] = max(track[FUSED], observation[TIME])
     track[SEEN] = t
     track[COUNT] += 1.0
-    track_filter.newest(track, t, x, P, noise)
+    _see_motion(track, t, x, P, parameters)
+
+
+@njit(cache=True)
+def _see_motion(track, t, x, P, parameters):
+    """See whether a track moves: if its velocity is not explained by the odometry's error."""
+    track_filter.newest(track, t, x, P, _noise(track, parameters))
     drift = parameters[_DRIFT_SPEED] ** 2
     speed = x[3] * x[3] / (P[3, 3] + drift) + x[4] * x[4] / (P[4, 4] + drift)
     track[MOVES] = 1.0 if speed > parameters[_GATE_2] else 0.0
@@ -448,7 +498,8 @@ def _credit(tracks, i, time, memory, parameters):
         return
     memory[_CODE_SEEN] = time
     odds = -parameters[_MARKER_ODDS] * math.expm1(-interval / parameters[_MARKER_TIME])
-    tracks[i, CODE] = min(tracks[i, CODE] + odds, parameters[_ODDS_LIMIT])
+    limit = parameters[_ODDS_LIMIT] - tracks[i, PRIOR]
+    tracks[i, CODE] = min(tracks[i, CODE] + odds, limit)
     for j in range(tracks.shape[0]):
         if j != i and time - tracks[j, FUSED] > _UNSEEN:
             tracks[j, CODE] = max(tracks[j, CODE] - odds, 0.0)
@@ -495,6 +546,158 @@ def _write_measurement(measurement, t, validity, found, source):
 
 
 @njit(cache=True)
+def _arrived(measurement, memory, last):
+    """Whether a measurement is new; `last` is the place of the last arrival in the memory."""
+    if measurement[VALID] == 0.0 or measurement[TIME_OF_ARRIVAL] == memory[last]:
+        return False
+    memory[last] = measurement[TIME_OF_ARRIVAL]
+    return True
+
+
+@njit(cache=True)
+def _sight(
+    target,
+    measurement,
+    tracks,
+    observation,
+    found,
+    p_OB,
+    height_sigma,
+    source,
+    taken,
+    leader,
+    t,
+    x,
+    P,
+    parameters,
+):
+    """Give a sighting to its track or begin one; returns its number, -1 if there is no room.
+
+    What belongs to the leader, or to anything while there is none, becomes the `measurement`.
+    """
+    gate = parameters[_GATE_2] if observation[ROW_COUNT] == 2.0 else parameters[_GATE_3]
+    named = source == MARKER_SOURCE
+    i, squared = _associate(tracks, observation, gate, taken, named, x, P, parameters)
+    if i < 0:
+        time = observation[TIME]
+        i = _begin(tracks, t, time, found, p_OB, height_sigma, parameters, x, P)
+        squared = 0.0
+    if i < 0:
+        return i
+    _take(tracks[i], observation, t, x, P, parameters)
+    if i == leader or leader < 0:
+        target[_T_RATIO] = squared / gate
+        target[_T_SOURCE] = source
+        _write_measurement(measurement, t, observation[TIME], found, source)
+    return i
+
+
+@njit(cache=True)
+def _place_blob(
+    tracks, validity, x_C, y_C, estimate, p_OB, q_WB, X_BI, leader, observation, x, P, parameters
+):
+    """Write the observation of a blob at the pad's height; p_BP_W, and the height's sigma (m).
+
+    NaN for a blob that says nothing.
+    """
+    height, sigma = math.nan, parameters[_GROUND_NOISE]
+    if leader >= 0:
+        observation[TIME], observation[KICK] = validity, 0.0
+        track_filter.prior(tracks[leader], observation, x, P, _noise(tracks[leader], parameters))
+        height = p_OB[2] - x[2]
+        sigma = max(sigma, math.sqrt(P[2, 2]))
+    elif estimate[_E_HEIGHT_VALID] > 0.0:
+        height = estimate[_E_HEIGHT]
+    cut_off = height < 1.0 and max(abs(x_C), abs(y_C)) > _EDGE
+    if cut_off or not math.isfinite(height):
+        return np.full(9, np.nan), sigma
+    found = observe_blob(observation, validity, x_C, y_C, height, p_OB, q_WB, X_BI, parameters)
+    return found, sigma
+
+
+@njit(cache=True)
+def _take_range(tracks, ranging, p_OB, q_WB, observation, x, P, parameters):
+    """Fuse a range into every track that it fits. It is no sighting: it does not count."""
+    validity, reach = ranging[TIME_OF_VALIDITY], ranging[_RANGE]
+    R_WB = rotation_matrix(q_WB)
+    for i in range(tracks.shape[0]):
+        if tracks[i, BORN] < 0.0:
+            continue
+        observation[TIME], observation[KICK] = validity, 0.0
+        noise = _noise(tracks[i], parameters)
+        track_filter.prior(tracks[i], observation, x, P, noise)
+        off = math.hypot(p_OB[0] - reach * R_WB[0, 2] - x[0], p_OB[1] - reach * R_WB[1, 2] - x[1])
+        off_pad = off > parameters[_PAD_RADIUS]
+        observe_range(observation, validity, ranging, p_OB, q_WB, off_pad, parameters)
+        squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
+        if squared <= parameters[_GATE_2]:
+            track_filter.insert(tracks[i], observation, x, P, noise)
+
+
+@njit(cache=True)
+def _keep_fix(memory, gnss, p_OB, parameters):
+    """Remember where the vehicle's own receiver puts the odometry's origin."""
+    place = world_from_geodetic(gnss[_LATITUDE : _LATITUDE + 3], parameters[_ORIGIN : _ORIGIN + 3])
+    memory[_FIX_TIME], memory[_FIX_TYPE] = gnss[TIME_OF_VALIDITY], gnss[_FIX]
+    for i in range(3):
+        memory[_FIX_X + i] = p_OB[i] - place[i]
+        memory[_FIX_VARIANCE + i] = gnss[_H_ACCURACY if i < 2 else _V_ACCURACY] ** 2
+
+
+@njit(cache=True)
+def _take_pad_gnss(tracks, memory, t, gnss, p_OB, taken, observation, x, P, parameters):
+    """Fuse what the pad's own receiver says; begin a hypothesis if it is precise enough.
+
+    A receiver's errors last, so the place is fused only where less is known than it says.
+    """
+    time = gnss[TIME_OF_VALIDITY]
+    if memory[_FIX_TIME] < 0.0 or abs(time - memory[_FIX_TIME]) > _FIX_OLD:
+        return
+    precise = gnss[_FIX] >= _RTK_FIXED and memory[_FIX_TYPE] >= _RTK_FIXED
+    lasting = 0.0 if precise else parameters[_GNSS_ERROR] ** 2
+    place = world_from_geodetic(gnss[_LATITUDE : _LATITUDE + 3], parameters[_ORIGIN : _ORIGIN + 3])
+    H, R, values = np.zeros((3, STATES)), np.zeros((3, 3)), np.zeros(3)
+    found = np.zeros(9)
+    for i in range(3):
+        values[i] = place[i] + memory[_FIX_X + i]
+        found[i] = values[i] - p_OB[i]
+        H[i, i] = 1.0
+        accuracy = gnss[_H_ACCURACY if i < 2 else _V_ACCURACY]
+        R[i, i] = accuracy * accuracy + memory[_FIX_VARIANCE + i] + lasting
+    variance, height_sigma = R[0, 0], math.sqrt(R[2, 2])
+    track_filter.whiten(observation, time, H, values, R, 2)
+    i, _ = _associate(tracks, observation, parameters[_GATE_2], taken, True, x, P, parameters)
+    if i < 0 and variance <= parameters[_KNOWN] ** 2:
+        i = _begin(tracks, t, time, found, p_OB, height_sigma, parameters, x, P)
+    if i < 0:
+        return
+    noise = _noise(tracks[i], parameters)
+    if track_filter.prior(tracks[i], observation, x, P, noise) and P[0, 0] > variance:
+        track_filter.insert(tracks[i], observation, x, P, noise)
+
+    H[:], R[:] = 0.0, 0.0
+    for k in range(3):
+        H[k, 3 + k] = 1.0
+        values[k] = gnss[_GNSS_V + k]
+        R[k, k] = gnss[_SPEED_ACCURACY] ** 2 + parameters[_DRIFT_SPEED] ** 2
+    track_filter.whiten(observation, time, H, values, R, 3)
+    squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
+    since = time - max(tracks[i, FUSED], memory[_PAD_GNSS_FUSED])
+    if squared > parameters[_GATE_3] and since > 0.0:
+        observation[KICK], observation[SINCE] = parameters[_SPEED] ** 2, since
+        squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
+    if squared <= parameters[_GATE_3]:
+        track_filter.insert(tracks[i], observation, x, P, noise)
+        memory[_PAD_GNSS_FUSED] = time
+    if precise:
+        tracks[i, FUSED] = max(tracks[i, FUSED], time)
+        tracks[i, SEEN] = t
+        tracks[i, COUNT] += 1.0
+        _credit(tracks, i, time, memory, parameters)
+    _see_motion(tracks[i], t, x, P, parameters)
+
+
+@njit(cache=True)
 def poll(
     target,
     measurement,
@@ -504,11 +707,16 @@ def poll(
     t,
     infrared,
     marker,
+    svgs,
+    gnss,
+    pad_gnss,
     ranging,
     estimate,
     parameters,
     X_BI,
     X_BM,
+    X_BS,
+    placements,
 ):
     """One event at time t (s).
 
@@ -520,11 +728,13 @@ def poll(
         Updated in place.
     tracks : array of shape (HYPOTHESES, TRACK)
         Updated in place.
-    infrared, marker, ranging, estimate : arrays
-        Of the layouts INFRARED, MARKER, RANGE_FINDER and VEHICLE_ESTIMATE.
+    infrared, marker, svgs, gnss, pad_gnss, ranging, estimate : arrays
+        Of the layouts INFRARED, MARKER, SVGS, GNSS twice, RANGE_FINDER and VEHICLE_ESTIMATE.
     parameters : array of shape (PARAMETERS.size,)
-    X_BI, X_BM : arrays of shape (3, 4)
-        Mounts of the infrared and of the marker camera.
+    X_BI, X_BM, X_BS : arrays of shape (3, 4)
+        Mounts of the infrared, the marker and the SVGS camera.
+    placements : array of shape (3, 4)
+        Of the SVGS beacons in P, as in `pad_from_pose`.
     """
     if estimate[_E_ATTITUDE_VALID] > 0.0 and estimate[_E_H_VALID] > 0.0:
         _remember_pose(memory, estimate)
@@ -536,103 +746,82 @@ def poll(
     observation = np.zeros(OBSERVATION)
     taken = np.zeros(tracks.shape[0], np.bool_)
     probability = np.empty(tracks.shape[0])
+    parameters = parameters.copy()
+    parameters[_HERE] = memory[_RING + _POSE * (int(memory[_POLLS] - 1.0) % POSES) + 3]
     leader = _probabilities(tracks, t, x, P, parameters, probability)
     sources = int(parameters[_SOURCES])
 
     if (
         sources & MARKER_SOURCE
-        and marker[VALID] > 0.0
-        and marker[TIME_OF_ARRIVAL] != memory[_MARKER_ARRIVAL]
+        and _arrived(marker, memory, _MARKER_ARRIVAL)
+        and _pose_at(memory, marker[TIME_OF_VALIDITY], p, q)
     ):
-        memory[_MARKER_ARRIVAL] = marker[TIME_OF_ARRIVAL]
         validity = marker[TIME_OF_VALIDITY]
-        if _pose_at(memory, validity, p, q):
-            found = observe_marker(observation, validity, marker, p, q, X_BM, parameters)
-            gate = parameters[_GATE_3]
-            i, squared = _associate(tracks, observation, gate, taken, True, x, P, parameters)
-            if i < 0:
-                sigma = parameters[_RADIUS]
-                i = _begin(tracks, t, validity, found, p, sigma, parameters, x, P)
-                squared = 0.0
-            if i >= 0:
-                _take(tracks[i], observation, t, x, P, parameters)
-                _credit(tracks, i, validity, memory, parameters)
-            if i == leader or leader < 0:
-                target[_T_RATIO] = squared / gate
-                target[_T_REJECTED] = 0.0
-                target[_T_SOURCE] = MARKER_SOURCE
-                _write_measurement(measurement, t, validity, found, MARKER_SOURCE)
-            else:
-                target[_T_REJECTED] += 1.0
+        found = observe_marker(observation, validity, marker, p, q, X_BM, parameters)
+        i = _sight(
+            target, measurement, tracks, observation, found, p, parameters[_RADIUS],
+            MARKER_SOURCE, taken, leader, t, x, P, parameters,
+        )  # fmt: skip
+        if i >= 0:
+            _credit(tracks, i, validity, memory, parameters)
+        own = i >= 0 and (i == leader or leader < 0)
+        target[_T_REJECTED] = 0.0 if own else target[_T_REJECTED] + 1.0
+
+    if (
+        sources & SVGS_SOURCE
+        and _arrived(svgs, memory, _SVGS_ARRIVAL)
+        and svgs[_BEACON] >= 0.0
+        and _pose_at(memory, svgs[TIME_OF_VALIDITY], p, q)
+    ):
+        validity = svgs[TIME_OF_VALIDITY]
+        found = observe_svgs(observation, validity, svgs, p, q, X_BS, placements, parameters)
+        i = _sight(
+            target, measurement, tracks, observation, found, p, parameters[_RADIUS],
+            SVGS_SOURCE, taken, leader, t, x, P, parameters,
+        )  # fmt: skip
+        own = i >= 0 and (i == leader or leader < 0)
+        target[_T_REJECTED] = 0.0 if own else target[_T_REJECTED] + 1.0
 
     if (
         sources & INFRARED_SOURCE
-        and infrared[VALID] > 0.0
-        and infrared[TIME_OF_ARRIVAL] != memory[_IR_ARRIVAL]
+        and _arrived(infrared, memory, _IR_ARRIVAL)
+        and _pose_at(memory, infrared[TIME_OF_VALIDITY], p, q)
     ):
-        memory[_IR_ARRIVAL] = infrared[TIME_OF_ARRIVAL]
         validity = infrared[TIME_OF_VALIDITY]
-        if _pose_at(memory, validity, p, q):
-            fused = False
-            for blob in range(min(int(infrared[_COUNT_BLOBS]), INFRARED_BLOBS)):
-                bx, by = infrared[_BLOB + 3 * blob], infrared[_BLOB + 3 * blob + 1]
-                height, height_sigma = math.nan, parameters[_GROUND_NOISE]
-                if leader >= 0:
-                    observation[TIME], observation[KICK] = validity, 0.0
-                    noise = _noise(tracks[leader], parameters)
-                    track_filter.prior(tracks[leader], observation, x, P, noise)
-                    height = p[2] - x[2]
-                    height_sigma = max(height_sigma, math.sqrt(P[2, 2]))
-                elif estimate[_E_HEIGHT_VALID] > 0.0:
-                    height = estimate[_E_HEIGHT]
-                if not math.isfinite(height):
-                    continue
-                if height < 1.0 and max(abs(bx), abs(by)) > _EDGE:
-                    continue
-                found = observe_blob(observation, validity, bx, by, height, p, q, X_BI, parameters)
-                if not math.isfinite(found[0]):
-                    continue
-                gate = parameters[_GATE_2]
-                i, squared = _associate(tracks, observation, gate, taken, False, x, P, parameters)
-                if i < 0:
-                    i = _begin(tracks, t, validity, found, p, height_sigma, parameters, x, P)
-                    squared = 0.0
-                if i < 0:
-                    continue
+        fused = False
+        for blob in range(min(int(infrared[_COUNT_BLOBS]), INFRARED_BLOBS)):
+            bx, by = infrared[_BLOB + 3 * blob], infrared[_BLOB + 3 * blob + 1]
+            found, sigma = _place_blob(
+                tracks, validity, bx, by, estimate, p, q, X_BI, leader, observation, x, P,
+                parameters,
+            )  # fmt: skip
+            if not math.isfinite(found[0]):
+                continue
+            i = _sight(
+                target, measurement, tracks, observation, found, p, sigma,
+                INFRARED_SOURCE, taken, leader, t, x, P, parameters,
+            )  # fmt: skip
+            if i >= 0:
                 taken[i] = True
-                _take(tracks[i], observation, t, x, P, parameters)
-                if i == leader or leader < 0:
-                    fused = True
-                    target[_T_RATIO] = squared / gate
-                    target[_T_SOURCE] = INFRARED_SOURCE
-                    _write_measurement(measurement, t, validity, found, INFRARED_SOURCE)
-            target[_T_REJECTED] = 0.0 if fused else target[_T_REJECTED] + 1.0
+                fused |= i == leader or leader < 0
+        target[_T_REJECTED] = 0.0 if fused else target[_T_REJECTED] + 1.0
 
     memory[_RANGE_POLLS] += 1.0
     if (
         memory[_RANGE_POLLS] >= _RANGE_EVERY
-        and ranging[VALID] > 0.0
-        and ranging[TIME_OF_ARRIVAL] != memory[_RANGE_ARRIVAL]
+        and _arrived(ranging, memory, _RANGE_ARRIVAL)
         and _pose_at(memory, ranging[TIME_OF_VALIDITY], p, q)
     ):
-        memory[_RANGE_ARRIVAL] = ranging[TIME_OF_ARRIVAL]
         memory[_RANGE_POLLS] = 0.0
-        for i in range(tracks.shape[0]):
-            if tracks[i, BORN] < 0.0:
-                continue
-            observation[TIME], observation[KICK] = ranging[TIME_OF_VALIDITY], 0.0
-            noise = _noise(tracks[i], parameters)
-            track_filter.prior(tracks[i], observation, x, P, noise)
-            R_WB = rotation_matrix(q)
-            reach = ranging[_RANGE]
-            off = math.hypot(p[0] - reach * R_WB[0, 2] - x[0], p[1] - reach * R_WB[1, 2] - x[1])
-            off_pad = off > parameters[_PAD_RADIUS]
-            validity = ranging[TIME_OF_VALIDITY]
-            observe_range(observation, validity, ranging, p, q, off_pad, parameters)
-            squared, _ = _squared_innovation(tracks[i], observation, x, P, parameters)
-            if squared <= parameters[_GATE_2]:
-                # A range is no sighting: it does not count.
-                track_filter.insert(tracks[i], observation, x, P, noise)
+        _take_range(tracks, ranging, p, q, observation, x, P, parameters)
+
+    if _arrived(gnss, memory, _GNSS_ARRIVAL) and _pose_at(memory, gnss[TIME_OF_VALIDITY], p, q):
+        _keep_fix(memory, gnss, p, parameters)
+    if _arrived(pad_gnss, memory, _PAD_GNSS_ARRIVAL) and _pose_at(
+        memory, pad_gnss[TIME_OF_VALIDITY], p, q
+    ):
+        taken[:] = False
+        _take_pad_gnss(tracks, memory, t, pad_gnss, p, taken, observation, x, P, parameters)
 
     _tidy(tracks, t, x, P, parameters)
     _write_target(target, hypotheses, tracks, t, memory, estimate, x, P, parameters, probability)
@@ -648,7 +837,8 @@ def _tidy(tracks, t, x, P, parameters):
         if tracks[i, BORN] < 0.0:
             continue
         known = _known(tracks[i], t, x, P, parameters)
-        if max(P[0, 0], P[1, 1]) > parameters[_FORGET_RADIUS] ** 2:
+        slope = parameters[_FORGET_SLOPE] * (parameters[_HERE] - x[2])
+        if max(P[0, 0], P[1, 1]) > max(parameters[_FORGET_RADIUS], slope) ** 2:
             tracks[i, BORN] = -1.0
             continue
         ix, iy = x[0], x[1]

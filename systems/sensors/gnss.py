@@ -10,10 +10,9 @@ from pydantic import Field
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
 from systems.configuration import Metres, NonNegative, Positive, Vector3, configuration
-from systems.frames import ned_from_world
-from systems.runway_frames import ecef_from_geodetic, geodetic_from_ecef, ned_from_ecef_rotation
+from systems.geodesy import geodetic_from_world
 from systems.schedule import CLOCK_PERIOD
-from systems.signals.measurement import BODY_STATE, GNSS, no_measurement
+from systems.signals.measurement import BODY_STATE, GNSS, PAD_STATE, no_measurement
 from systems.signals.noise import standard_normals, stream_key
 
 _CEP = 1.1774  # radius of the circle that holds half of a unit bivariate normal
@@ -138,13 +137,18 @@ class GnssConfig:
             values[field] = getattr(receiver, field) if override is None else override
         return Receiver(**values)
 
-    def add_to(self, builder: DiagramBuilder, name: str, seed: int) -> "Gnss":
-        """Add a `Gnss`; `name` also names its random stream."""
-        return builder.AddNamedSystem(name, Gnss(self, seed, stream=name))
+    def add_to(
+        self, builder: DiagramBuilder, name: str, seed: int, carrier: "Carrier" = "body"
+    ) -> "Gnss":
+        """Add a `Gnss` on `carrier`; `name` also names its random stream."""
+        return builder.AddNamedSystem(name, Gnss(self, seed, stream=name, carrier=carrier))
 
 
-_P = BODY_STATE.slice("p_WB").start
-_V = BODY_STATE.slice("v_WB").start
+Carrier = Literal["body", "pad"]
+_CARRIED = {
+    "body": (BODY_STATE, BODY_STATE.slice("p_WB"), BODY_STATE.slice("v_WB")),
+    "pad": (PAD_STATE, PAD_STATE.slice("p_WP"), PAD_STATE.slice("v_WP")),
+}
 _LATITUDE = GNSS.index("latitude")
 _V_W = GNSS.slice("v_W").start
 _REPORTED = GNSS.index("horizontal_accuracy")
@@ -152,18 +156,20 @@ _EARLY = 1e-6  # samples, so that rounding does not make one late
 
 
 @njit(cache=True)
-def geodetic_from_world(p_W, origin):
-    """The compiled twin of `systems.frames.geodetic_from_world`: deg, deg, m, shape (3,)."""
-    latitude, longitude = math.radians(origin[0]), math.radians(origin[1])
-    R_NE = ned_from_ecef_rotation(longitude, latitude)
-    p_E = ecef_from_geodetic(longitude, latitude, origin[2]) + R_NE.T @ ned_from_world(p_W)
-    geodetic = geodetic_from_ecef(p_E)
-    return np.array([math.degrees(geodetic[1]), math.degrees(geodetic[0]), geodetic[2]])
-
-
-@njit(cache=True)
 def sample_gnss(
-    index, time, body, key, origin, sigmas, keep, blend, relative, reported, output, memory
+    index,
+    time,
+    p_true,
+    v_true,
+    key,
+    origin,
+    sigmas,
+    keep,
+    blend,
+    relative,
+    reported,
+    output,
+    memory,
 ):
     """Write one GNSS measurement.
 
@@ -173,8 +179,8 @@ def sample_gnss(
         Of the sample.
     time : float
         s, now.
-    body : array of shape (17,)
-        `BODY_STATE`.
+    p_true, v_true : arrays of shape (3,)
+        Of the antenna in W, m and m/s.
     key : np.uint64
         Of the sensor's stream of noise.
     origin : array of shape (3,)
@@ -204,8 +210,8 @@ def sample_gnss(
             memory[i] = keep * memory[i] + math.sqrt(1.0 - keep * keep) * drift
             memory[3 + i] += blend * (memory[i] - memory[3 + i])
         error = memory[3 + i] - memory[6 + i] if relative else memory[3 + i] + sigmas[3, i]
-        p_W[i] = body[_P + i] + error + sigmas[0, i] * n[i]
-        output[_V_W + i] = body[_V + i] + sigmas[2, i] * n[6 + i]
+        p_W[i] = p_true[i] + error + sigmas[0, i] * n[i]
+        output[_V_W + i] = v_true[i] + sigmas[2, i] * n[6 + i]
     output[0] = output[1] = time
     output[2] = index
     output[3] = 1.0 if reported[3] >= 3.0 else 0.0
@@ -214,7 +220,7 @@ def sample_gnss(
 
 
 class Gnss(LeafSystem):
-    """A GNSS receiver with its antenna at the body's origin.
+    """A GNSS receiver with its antenna at the origin of the vehicle's body, or of the pad.
 
     .. pydrake_system::
 
@@ -226,7 +232,7 @@ class Gnss(LeafSystem):
 
     | port | layout | meaning |
     |---|---|---|
-    | `body` | `BODY_STATE` | the true state of the body |
+    | `body` | `BODY_STATE` | the true state of the body; on a pad `pad`, `PAD_STATE` |
     | `measurement` | `GNSS` | geodetic position, velocity in W, reported quality |
 
     With δ = 1/rate, n standard normal and an axis each,
@@ -253,13 +259,23 @@ class Gnss(LeafSystem):
     seed : int
     stream : str
         The name of the random stream; sensors that share it under one seed err alike.
+    carrier : "body" or "pad"
+        What the antenna is on.
     """
 
-    def __init__(self, config: GnssConfig, seed: int = 0, *, stream: str = "gnss"):
+    def __init__(
+        self,
+        config: GnssConfig,
+        seed: int = 0,
+        *,
+        stream: str = "gnss",
+        carrier: Carrier = "body",
+    ):
         super().__init__()
         self._stream = stream
         self.configure(config, seed)
-        self._body = self.DeclareVectorInputPort("body", BODY_STATE.size).Eval
+        layout, self._p, self._v = _CARRIED[carrier]
+        self._state = self.DeclareVectorInputPort(carrier, layout.size).Eval
         output = self.DeclareDiscreteState(no_measurement(GNSS))
         self.DeclareDiscreteState(np.zeros(9))
         self.DeclareStateOutputPort("measurement", output)
@@ -296,10 +312,12 @@ class Gnss(LeafSystem):
         index = math.floor(time * self._rate + _EARLY)
         if index == math.floor((time - CLOCK_PERIOD) * self._rate + _EARLY):
             return
+        state = self._state(context)
         sample_gnss(
             index,
             time,
-            self._body(context),
+            state[self._p],
+            state[self._v],
             self._key,
             self._origin,
             self._sigmas,

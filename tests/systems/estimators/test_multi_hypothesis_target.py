@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.stats import chi2
 
+from plants.svgs_beacons import SvgsBeaconsConfig
 from systems.estimators import multi_hypothesis_target_filter as track_filter
 from systems.estimators.fused_sensor import no_target
 from systems.estimators.multi_hypothesis_target import (
@@ -15,10 +16,14 @@ from systems.estimators.multi_hypothesis_target import (
     TargetSensorsConfig,
 )
 from systems.estimators.multi_hypothesis_target_kernel import TARGET_HYPOTHESES
+from systems.frames import geodetic_from_world
+from systems.sensors.gnss import RECEIVERS
 from systems.signals.measurement import (
+    GNSS,
     INFRARED,
     MARKER,
     RANGE_FINDER,
+    SVGS,
     TARGET_ESTIMATE,
     VEHICLE_ESTIMATE,
     no_measurement,
@@ -43,7 +48,9 @@ NOISE = REST
 
 def config(mode="fused", **fields):
     origin = [0.0, 0.0, 0.0]
-    sensors = TargetSensorsConfig(mode=mode, infrared_position=origin, marker_position=origin)
+    sensors = TargetSensorsConfig(
+        mode=mode, infrared_position=origin, marker_position=origin, svgs_position=origin
+    )
     return MultiHypothesisTargetConfig(front_end=sensors, **fields)
 
 
@@ -51,7 +58,8 @@ def test_topology():
     system = MultiHypothesisTarget(config())
     assert_matches_docstring(system)
     inputs, outputs = port_names(system)
-    assert inputs == ["infrared", "marker", "range_finder", "estimate"]
+    assert inputs[:4] == ["infrared", "marker", "svgs", "gnss"]
+    assert inputs[4:] == ["pad_gnss", "range_finder", "estimate"]
     assert outputs[:2] == ["target", "measurement"]
     assert periodic_update(system) == (PERIOD, 0.0)
 
@@ -114,26 +122,19 @@ def random_measurements(rng, count, duration):
     measurements = []
     for time in times:
         rows = int(rng.integers(1, 4))
-        H5 = rng.standard_normal((rows, 5))
+        H = rng.standard_normal((rows, 8))
         A = 0.1 * rng.standard_normal((rows, rows))
         R = A @ A.T + 0.01 * np.eye(rows)
-        measurements.append((time, H5, rng.standard_normal(rows), R))
+        measurements.append((time, H, rng.standard_normal(rows), R))
     return measurements
 
 
-def full(H5):
-    """Rows over (p, b) as rows over the state."""
-    H = np.zeros((len(H5), 8))
-    H[:, :3], H[:, 6:] = H5[:, :3], H5[:, 3:]
-    return H
-
-
-def observation(time, H5, z, R):
+def observation(time, H, z, R):
     rows = len(z)
-    H, values, covariance = np.zeros((3, 5)), np.zeros(3), np.zeros((3, 3))
-    H[:rows], values[:rows], covariance[:rows, :rows] = H5, z, R
+    coefficients, values, covariance = np.zeros((3, 8)), np.zeros(3), np.zeros((3, 3))
+    coefficients[:rows], values[:rows], covariance[:rows, :rows] = H, z, R
     packed = np.zeros(track_filter.OBSERVATION)
-    track_filter.whiten(packed, time, H, values, covariance, rows)
+    track_filter.whiten(packed, time, coefficients, values, covariance, rows)
     return packed
 
 
@@ -168,9 +169,9 @@ def test_any_order_of_arrival_gives_the_filter_that_had_them_in_order(seed):
     track, x, P = start()
     reference = Reference(x, P, 0.0, NOISE)
     measurements = random_measurements(rng, 40, 1.0)
-    for time, H5, z, R in measurements:
+    for time, H, z, R in measurements:
         reference.predict(time)
-        reference.fuse(full(H5), z, R)
+        reference.fuse(H, z, R)
     reference.predict(1.1)
     for i in rng.permutation(len(measurements)):
         packed = observation(*measurements[i])
@@ -184,10 +185,10 @@ def test_a_full_buffer_forgets_nothing_of_what_came_in_order():
     rng = np.random.default_rng(7)
     track, x, P = start()
     reference = Reference(x, P, 0.0, NOISE)
-    for time, H5, z, R in random_measurements(rng, 3 * track_filter.SLOTS, 4.0):
+    for time, H, z, R in random_measurements(rng, 3 * track_filter.SLOTS, 4.0):
         reference.predict(time)
-        reference.fuse(full(H5), z, R)
-        packed = observation(time, H5, z, R)
+        reference.fuse(H, z, R)
+        packed = observation(time, H, z, R)
         track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), NOISE)
     assert track[track_filter.USED] == track_filter.SLOTS
     x, P = answer(track, 4.0)
@@ -203,20 +204,20 @@ def late_by_a_buffer(seed, noise):
     truth = x + np.linalg.cholesky(P) @ rng.standard_normal(8)
     track, (in_order, without) = start()[0], (Reference(x, P, 0.0, noise) for _ in range(2))
     now, kept = 0.0, None
-    for i, (time, H5, _, R) in enumerate(random_measurements(rng, 130, 3.0)):
+    for i, (time, H, _, R) in enumerate(random_measurements(rng, 130, 3.0)):
         step = Reference(truth, np.zeros((8, 8)), now, noise)
         step.predict(time)
         truth = step.x + np.linalg.cholesky(step.P + 1e-15 * np.eye(8)) @ rng.standard_normal(8)
         now = time
-        z = full(H5) @ truth + np.linalg.cholesky(R) @ rng.standard_normal(len(R))
+        z = H @ truth + np.linalg.cholesky(R) @ rng.standard_normal(len(R))
         in_order.predict(time)
-        in_order.fuse(full(H5), z, R)
-        packed = observation(time, H5, z, R)
+        in_order.fuse(H, z, R)
+        packed = observation(time, H, z, R)
         if i == 60:
             kept = packed
             continue
         without.predict(time)
-        without.fuse(full(H5), z, R)
+        without.fuse(H, z, R)
         assert track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), noise)
     # 69 younger ones, more than a full buffer of 48
     assert track_filter.insert(track, kept, np.empty(8), np.empty((8, 8)), noise)
@@ -252,12 +253,12 @@ def test_what_is_older_than_the_archive_is_refused():
 def test_innovation_is_normalised_with_the_prior():
     rng = np.random.default_rng(1)
     track, x, P = start()
-    (time, H5, z, R), *_ = random_measurements(rng, 1, 1.0)
+    (time, H, z, R), *_ = random_measurements(rng, 1, 1.0)
     reference = Reference(x, P, 0.0, NOISE)
     reference.predict(time)
-    expected = reference.fuse(full(H5), z, R)
+    expected = reference.fuse(H, z, R)
     x, P = np.empty(8), np.empty((8, 8))
-    packed = observation(time, H5, z, R)
+    packed = observation(time, H, z, R)
     assert track_filter.prior(track, packed, x, P, NOISE)
     found, _ = track_filter.fuse(x, P, packed)
     assert found == pytest.approx(expected, rel=1e-4)
@@ -265,7 +266,7 @@ def test_innovation_is_normalised_with_the_prior():
 
 def test_a_kick_is_a_change_of_the_velocity_some_time_before():
     """A slot with a kick 0.2 s before it: as P had been larger then, but for the drift since."""
-    packed = observation(0.5, np.eye(5)[:3], np.array([1.5, -2.0, 0.4]), 1e-4 * np.eye(3))
+    packed = observation(0.5, np.eye(8)[:3], np.array([1.5, -2.0, 0.4]), 1e-4 * np.eye(3))
     packed[track_filter.KICK], packed[track_filter.SINCE] = 2.0, 0.2
     track, x, P = start()
     track_filter.insert(track, packed, np.empty(8), np.empty((8, 8)), MOVING)
@@ -274,7 +275,7 @@ def test_a_kick_is_a_change_of_the_velocity_some_time_before():
     reference.P[3, 3] += 2.0
     reference.P[4, 4] += 2.0
     reference.predict(0.5)
-    reference.fuse(full(np.eye(5)[:3]), np.array([1.5, -2.0, 0.4]), 1e-4 * np.eye(3))
+    reference.fuse(np.eye(8)[:3], np.array([1.5, -2.0, 0.4]), 1e-4 * np.eye(3))
     x, P = np.empty(8), np.empty((8, 8))
     track_filter.newest(track, 0.5, x, P, MOVING)
     np.testing.assert_allclose(x, reference.x, atol=1e-6)
@@ -659,3 +660,169 @@ def test_a_reset_of_the_navigation_filter_does_not_move_the_target():
     settled = world.times > 1.5
     assert field(targets, "acquired")[settled].all()
     assert distance_from_pad(world, targets)[settled].max() < 0.01
+
+
+# -- light beacons, and the receivers of pad and vehicle
+
+
+def svgs_pose(p_BP_W, validity, arrival, beacon=0):
+    """An SVGS measurement of a beacon that stands as configured, from a level vehicle."""
+    settings = SvgsBeaconsConfig()
+    x, y, z, _ = settings.placements()[beacon]
+    p_BT = p_BP_W + np.array([x, y, z])
+    pose = no_measurement(SVGS)
+    pose[:4] = validity, arrival, round(arrival / PERIOD), 1.0
+    pose[SVGS.index("beacon")] = beacon
+    pose[SVGS.slice("p_CT")] = -p_BT[1], -p_BT[0], -p_BT[2]
+    # x_C = −y_W, y_C = −x_W, z_C = −z_W: half a turn about (1, −1, 0)
+    pose[SVGS.slice("q_CT")] = 0.0, np.sqrt(0.5), -np.sqrt(0.5), 0.0
+    diagonal = [f"covariance_{i}{i}" for i in range(6)]
+    pose[[SVGS.index(name) for name in diagonal]] = [1e-4] * 3 + [1e-6] * 3
+    return pose
+
+
+def test_an_svgs_pose_is_where_its_beacon_stands_on_the_pad():
+    sway = Sway(height=60.0, descent=0.7)
+    bench = Bench(MultiHypothesisTarget(config("svgs")))
+    silent = {"svgs": no_measurement(SVGS)}
+    for k in range(200):
+        t = k * PERIOD
+        if k >= 8 and k % 6 == 0:
+            then = t - 8 * PERIOD
+            silent["svgs"] = svgs_pose(-sway.position(then), then, t, beacon=(k // 6) % 3)
+        target = bench.step(k, estimate=sway.estimate(t), **silent)
+    target = TARGET_ESTIMATE(target)
+    assert target.acquired == 1.0
+    assert target.source == 4.0
+    found = target[TARGET_ESTIMATE.slice("p_BP_W")]
+    np.testing.assert_allclose(found, -sway.position(199 * PERIOD), atol=0.02)
+
+
+def test_from_high_up_less_need_be_known():
+    """60 m up a bearing bias of 10 mrad leaves 0.6 m, which is known; 3 m up it would not be."""
+    sway = Sway(height=60.0, descent=0.0)
+    for slope, acquired in ((0.05, 1.0), (0.0, 0.0)):
+        settings = config("svgs", known_slope=slope, known_radius=0.5)
+        bench = Bench(MultiHypothesisTarget(settings))
+        for k in range(150):
+            t = k * PERIOD
+            pose = svgs_pose(-sway.position(t), t, t)
+            target = bench.step(k, estimate=sway.estimate(t), svgs=pose)
+        assert TARGET_ESTIMATE(target).acquired == acquired
+
+
+class Receivers:
+    """Fixes of the vehicle and of a pad that drives, every 0.2 s, the pad's 0.2 s late."""
+
+    ORIGIN = (39.3622, 22.9420, 10.0)
+
+    def __init__(self, kind, pad_velocity=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0)):
+        self.kind, self.v = kind, np.array(pad_velocity)
+        self.offset = np.array(offset)  # m, of the pad's fixes from the truth
+        self.sway = Sway(height=5.0, descent=0.0)
+
+    def pad(self, t):
+        return np.array([0.5, -0.3, 0.0]) + self.v * t
+
+    def fix(self, p_W, v_W, validity, arrival):
+        receiver = RECEIVERS[self.kind]
+        fix = no_measurement(GNSS)
+        fix[:4] = validity, arrival, round(validity / 0.2), 1.0
+        fix[4:7] = geodetic_from_world(p_W, np.array(self.ORIGIN))
+        fix[GNSS.slice("v_W")] = v_W
+        for name in ("horizontal_accuracy", "vertical_accuracy", "speed_accuracy", "fix_type"):
+            fix[GNSS.index(name)] = getattr(receiver, name)
+        return fix
+
+    def fly(self, duration, settings=None, **others):
+        """The last target, and its error (m) there."""
+        bench = Bench(MultiHypothesisTarget(settings or config()))
+        gnss = pad_gnss = no_measurement(GNSS)
+        for k in range(round(duration / PERIOD)):
+            t = k * PERIOD
+            if k % 10 == 0:
+                gnss = self.fix(self.sway.position(t), self.sway.velocity(t), t, t)
+                if k >= 10:
+                    then = t - 0.2
+                    pad_gnss = self.fix(self.pad(then) + self.offset, self.v, then, t)
+            sensors = {name: make(k, t) for name, make in others.items()}
+            estimate = self.sway.estimate(t)
+            target = bench.step(k, estimate=estimate, gnss=gnss, pad_gnss=pad_gnss, **sensors)
+        error = target[TARGET_ESTIMATE.slice("p_BP_W")] - (self.pad(t) - self.sway.position(t))
+        return TARGET_ESTIMATE(target), error
+
+
+def test_receivers_with_fixed_ambiguities_find_a_pad_that_drives_alone():
+    target, error = Receivers("rtk", pad_velocity=(2.0, -1.0, 0.0)).fly(4.0)
+    assert target.acquired == 1.0
+    assert np.abs(error[:2]).max() < 0.05
+    np.testing.assert_allclose(target[TARGET_ESTIMATE.slice("v_WP")], [2.0, -1.0, 0.0], atol=0.1)
+    assert target.time_of_last_fusion > 3.5
+
+
+def test_receivers_that_wander_begin_nothing():
+    target, _ = Receivers("standalone").fly(4.0)
+    assert target.acquired == 0.0
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_pad_that_sets_off_unseen_is_followed_by_its_receivers_velocity(told):
+    """Seen for 2 s at rest, then 4 s unseen at 2 m/s; its fixes are 2 m off, for good."""
+    flight = Receivers("standalone", offset=(2.0, 0.0, 0.0))
+    start = 2.2  # s
+
+    def pad(t):
+        return np.array([0.5, -0.3, 0.0]) + np.array([2.0, 0.0, 0.0]) * max(t - start, 0.0)
+
+    flight.pad = pad
+    make = flight.fix
+
+    def fix(p_W, v_W, validity, arrival):
+        own = v_W is flight.v
+        v_W = np.array([2.0 if validity > start else 0.0, 0.0, 0.0]) if own else v_W
+        made = make(p_W, v_W, validity, arrival)
+        made[3] = float(told or not own)
+        return made
+
+    flight.fix = fix
+
+    def marker(k, t):
+        then = t if t < 2.0 else 2.0 - PERIOD
+        p_BP = pad(then) - flight.sway.position(then)
+        p_C = np.array([-p_BP[1], -p_BP[0], -p_BP[2]])
+        measurement = MARKER.zeros()
+        measurement[:4] = then, then, k, 1.0
+        measurement[MARKER.slice("bearing_C")] = p_C / np.linalg.norm(p_C)
+        measurement[MARKER.index("range")] = np.linalg.norm(p_C)
+        for name in ("covariance_xx", "covariance_yy", "covariance_rr"):
+            measurement[MARKER.index(name)] = 1e-6
+        return measurement
+
+    target, error = flight.fly(6.2, marker=marker)
+    missed = np.hypot(*error[:2])
+    assert target.acquired == 1.0
+    assert missed < 0.6 if told else missed > 7.0
+
+
+def test_a_lamp_beside_a_pad_with_fixed_ambiguities_is_not_the_pad():
+    """It has been seen alone for a second when the first fixes come."""
+    flight = Receivers("rtk")
+
+    def infrared(k, t):
+        spot = np.array(LAMP) - flight.sway.position(t)
+        measurement = INFRARED.zeros()
+        measurement[:4] = t, t, k, 1.0
+        measurement[INFRARED.index("count")] = 1.0
+        measurement[INFRARED.index("blob_0_x")] = spot[1] / spot[2]
+        measurement[INFRARED.index("blob_0_y")] = spot[0] / spot[2]
+        return measurement
+
+    def height(k, t):
+        ranging = RANGE_FINDER.zeros()
+        ranging[:4] = t, t, k, 1.0
+        ranging[RANGE_FINDER.index("range")] = flight.sway.position(t)[2]
+        return ranging
+
+    target, error = flight.fly(6.0, infrared=infrared, range_finder=height)
+    assert target.acquired == 1.0
+    assert np.abs(error[:2]).max() < 0.05

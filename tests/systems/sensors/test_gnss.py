@@ -7,10 +7,10 @@ import pytest
 from pyulog import ULog
 from scipy import stats
 
-from systems.frames import geodetic_from_world as reference_geodetic_from_world
-from systems.frames import world_from_geodetic
-from systems.sensors.gnss import RECEIVERS, Gnss, GnssConfig, geodetic_from_world
-from systems.signals.measurement import BODY_STATE, GNSS, no_measurement
+from systems import geodesy
+from systems.frames import geodetic_from_world, world_from_geodetic
+from systems.sensors.gnss import RECEIVERS, Gnss, GnssConfig
+from systems.signals.measurement import BODY_STATE, GNSS, PAD_STATE, no_measurement
 from tests.shared_data import shared
 from tests.system_contract import assert_matches_docstring, periodic_update
 from tests.systems.signals.playback import Bench
@@ -77,10 +77,21 @@ def test_clock(rate, intervals):
 @pytest.mark.parametrize("origin", [ORIGIN, [39.3622, 22.942, 10.0], [-33.9, 151.2, 50.0]])
 @pytest.mark.parametrize("p_W", [[0.0, 0.0, 0.0], [150.0, -80.0, 100.0], [-9000.0, 4000.0, 500.0]])
 def test_compiled_geodesy_is_pymap3d_s(p_W, origin):
-    compiled = geodetic_from_world(np.array(p_W), np.array(origin))
-    reference = reference_geodetic_from_world(np.array(p_W), np.array(origin))
+    compiled = geodesy.geodetic_from_world(np.array(p_W), np.array(origin))
+    reference = geodetic_from_world(np.array(p_W), np.array(origin))
     np.testing.assert_allclose(compiled[:2], reference[:2], rtol=0, atol=1e-11)  # 1 um
     assert compiled[2] == pytest.approx(reference[2], abs=1e-6)
+    back = geodesy.world_from_geodetic(reference, np.array(origin))
+    np.testing.assert_allclose(back, p_W, rtol=0, atol=1e-6)
+
+
+def test_on_a_pad_it_tells_the_pads_place_and_velocity():
+    pad = PAD_STATE.zeros()
+    pad[PAD_STATE.slice("p_WP")], pad[PAD_STATE.slice("v_WP")] = (3.0, 4.0, 0.5), (2.0, 0.0, 0.1)
+    gnss = Gnss(GnssConfig(origin=ORIGIN, **EXACT), 1, stream="pad_gnss", carrier="pad")
+    out = Bench(gnss, {"pad": pad}, log_period=LOG_PERIOD).advance_to(1.0).arrivals()
+    np.testing.assert_allclose(positions(out), np.tile([3.0, 4.0, 0.5], (len(out), 1)), atol=1e-6)
+    np.testing.assert_array_equal(out[:, VELOCITY], np.tile([2.0, 0.0, 0.1], (len(out), 1)))
 
 
 def test_without_errors_it_is_the_truth():
