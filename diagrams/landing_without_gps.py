@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Multiplexer
 
 from diagrams.recording import Recording
 from diagrams.runway_geometry import require_landing, same_but_for_seed
@@ -21,7 +22,7 @@ from systems.configuration import (
 from systems.controllers.fixed_wing_flight_controller import FixedWingFlightControllerConfig
 from systems.controllers.fixed_wing_guidance import RouteConfig
 from systems.controllers.fixed_wing_reference_flight import reference_flight
-from systems.estimators.runway_error_filter import FILTER_INPUTS, RunwayErrorFilterConfig
+from systems.estimators.runway_error_filter import RunwayErrorFilterConfig
 from systems.estimators.runway_improved_filter import RunwayImprovedFilterConfig
 from systems.estimators.runway_record import END, RunwayRecordConfig
 from systems.runway_frames import (
@@ -41,6 +42,7 @@ from systems.sensors.runway_wheel_encoder import RunwayWheelEncoderConfig
 from systems.signals.noise import stream_key
 from systems.signals.runway_measurement import (
     ANTENNA,
+    FILTER_INPUTS,
     FIX,
     FIXED_WING_COMMAND,
     FIXED_WING_STATE,
@@ -193,7 +195,12 @@ class LandingWithoutGpsDiagram:
             port["raw_picture"] = self.systems["camera"].GetOutputPort("measurement")
             connect("camera", state="seen_state")
             connect("tracker", picture="raw_picture", state="seen_state")
-        connect("filter", **{name: name for name, _ in FILTER_INPUTS})
+        gather = Multiplexer([layout.size for _, layout in FILTER_INPUTS])
+        builder.AddNamedSystem("measurements", gather)
+        for index, (name, _) in enumerate(FILTER_INPUTS):
+            builder.Connect(port[name], gather.get_input_port(index))
+        port["measurements"] = gather.get_output_port()
+        connect("filter", measurements="measurements")
         signals = ("estimate", "guidance", "fix", "laser", "picture", "wheel_speed")
         connect("phases", **{name: name for name in signals})
         connect("flight_controller", estimate="estimate", phase="phase")

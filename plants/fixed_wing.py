@@ -132,7 +132,7 @@ class FixedWing(LeafSystem):
         super().__init__()
         self._site: tuple[RunwayConfig, Terrain] | None = None
         self.configure(config, seed, runway, terrain)
-        self._command = self.DeclareVectorInputPort("command", FIXED_WING_COMMAND.size)
+        self._command = self.DeclareVectorInputPort("command", FIXED_WING_COMMAND.size).Eval
         state = self.DeclareDiscreteState(FIXED_WING_STATE.size)
         self.DeclareDiscreteState(MEMORY)
         self.DeclareStateOutputPort("state", state)
@@ -179,7 +179,7 @@ class FixedWing(LeafSystem):
         advance(
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
-            self._command.Eval(context),
+            self._command(context),
             self._parameters,
             self._grid.values,
             self._grid.geometry,

@@ -35,19 +35,22 @@ from systems.sensors.runway_wheel_encoder import wheel_sample
 from systems.signals.measurement import no_measurement
 from systems.signals.runway_measurement import (
     ACT_OFFSET,
-    AIRSPEED,
-    ANTENNA,
-    BARO_INERTIAL,
-    FIX,
+    AIRSPEED_AT,
+    ANTENNA_AT,
+    BARO_AT,
+    FIX_AT,
     FIXED_WING_STATE,
     GUIDANCE,
-    INERTIAL_NAVIGATION,
-    LASER_HEIGHT,
-    MAGNETIC_HEADING,
+    HEADING_AT,
+    LASER_AT,
+    MEASUREMENTS_END,
     NAVIGATION_ESTIMATE,
+    PHASE_AT,
     PICTURE,
-    WHEEL_SPEED,
+    PICTURE_AT,
+    WHEELS_AT,
     enqueue,
+    no_measurements,
     release,
 )
 
@@ -63,18 +66,6 @@ _SENSORS = (
     "heading",
     "wheel_encoder",
     "airspeed",
-)
-_LAYOUTS = (
-    INERTIAL_NAVIGATION,
-    BARO_INERTIAL,
-    FIX,
-    ANTENNA,
-    PICTURE,  # out of the camera
-    PICTURE,  # out of the tracker
-    LASER_HEIGHT,
-    MAGNETIC_HEADING,
-    WHEEL_SPEED,
-    AIRSPEED,
 )
 
 
@@ -112,11 +103,13 @@ def _fly(
     laser_model, heading_model, wheels_model, airspeed_model,
     is_improved, filter_model, filter_memory, estimate, guidance, controller, criteria,
     distances, passages, end, time_limit,
-    inertial, baro, fix, antenna, camera, picture, laser, heading, wheels, airspeed,
+    measurements, camera,
 ):  # fmt: skip
-    # what a filter sees of a measurement in a phase that does not use it
-    no_fix, no_antenna, no_picture = fix.copy(), antenna.copy(), picture.copy()
-    no_laser, no_wheels, no_airspeed = laser.copy(), wheels.copy(), airspeed.copy()
+    inertial, baro = measurements[:BARO_AT], measurements[BARO_AT:FIX_AT]
+    fix, antenna = measurements[FIX_AT:ANTENNA_AT], measurements[ANTENNA_AT:PICTURE_AT]
+    picture, laser = measurements[PICTURE_AT:LASER_AT], measurements[LASER_AT:PHASE_AT]
+    heading, wheels = measurements[HEADING_AT:WHEELS_AT], measurements[WHEELS_AT:AIRSPEED_AT]
+    airspeed = measurements[AIRSPEED_AT:MEASUREMENTS_END]
     seen = state.copy()
     if not closed:
         interpolate_flight(seen, flight, 0.0, terrain, geometry, 0.0, gear)
@@ -142,6 +135,7 @@ def _fly(
             phase = _next_phase(
                 phase, silent, criteria, estimate, guidance, laser, wheels, time - tracked
             )
+            measurements[PHASE_AT] = phase
             in_phase = in_phase + 4 * _TICK if phase == before else 0.0
             note(passages, end, now, estimate, before, distances, controller[1], time)
             if phase == 6.0 and in_phase >= criteria[5]:
@@ -195,34 +189,9 @@ def _fly(
                 controller[3], controller[4], 2.0 * _TICK,
             )  # fmt: skip
         if is_improved:
-            improved.step(
-                estimate,
-                filter_memory,
-                inertial,
-                baro,
-                fix if phase == 0.0 else no_fix,
-                antenna if 1.0 <= phase <= 4.0 else no_antenna,
-                picture if 2.0 <= phase <= 4.0 else no_picture,
-                laser if 3.0 <= phase <= 4.0 else no_laser,
-                phase,
-                heading,
-                wheels if phase >= 4.0 else no_wheels,
-                airspeed if phase <= 4.0 else no_airspeed,
-                filter_model,
-            )
+            improved.step(estimate, filter_memory, measurements, filter_model)
         else:
-            thesis.step(
-                estimate,
-                filter_memory,
-                inertial,
-                baro,
-                fix if phase == 0.0 else no_fix,
-                antenna if phase == 1.0 else no_antenna,
-                picture if 2.0 <= phase <= 3.0 else no_picture,
-                laser if phase == 3.0 else no_laser,
-                phase,
-                filter_model,
-            )
+            thesis.step(estimate, filter_memory, measurements, filter_model)
         if k % 4 == 0:  # after the filter, which sees what the tracker said before
             acting = ACT_OFFSET + time
             if camera[2] + 1.0 > picture_line[0]:
@@ -318,7 +287,8 @@ def fly_compiled(scenario: LandingWithoutGpsScenario, seed: int) -> dict[str, An
         passages,
         end,
         scenario.time_limit,
-        *(no_measurement(layout) for layout in _LAYOUTS),
+        no_measurements(),
+        no_measurement(PICTURE),
     ]
     _fly(*arguments)
     return landing_numbers(end, passages, scenario)

@@ -121,8 +121,8 @@ class FixedWingFlightController(LeafSystem):
     ):
         super().__init__()
         self.configure(config, seed, runway)
-        self._estimate = self.DeclareVectorInputPort("estimate", NAVIGATION_ESTIMATE.size)
-        self._phase = self.DeclareVectorInputPort("phase", PHASE_STATUS.size)
+        self._estimate = self.DeclareVectorInputPort("estimate", NAVIGATION_ESTIMATE.size).Eval
+        self._phase = self.DeclareVectorInputPort("phase", PHASE_STATUS.size).Eval
         command = self.DeclareDiscreteState(FIXED_WING_COMMAND.size)
         guidance = self.DeclareDiscreteState(GUIDANCE.size)
         self.DeclareStateOutputPort("command", command)
@@ -149,14 +149,14 @@ class FixedWingFlightController(LeafSystem):
         return self._waypoints, self._heading, self._profile, self._gains, self._deceleration
 
     def _control(self, context, discrete_state):
-        estimate = self._estimate.Eval(context)
+        estimate = self._estimate(context)
         if estimate[1] == 0.0:
             return
         control(
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
             estimate,
-            self._phase.Eval(context)[0],
+            self._phase(context)[0],
             self._waypoints,
             self._heading,
             self._profile,

@@ -10,41 +10,12 @@ from systems.configuration import Metres, NonNegative, Positive, Probability, co
 from systems.estimators.runway_error_filter_kernel import initial_memory, step
 from systems.runway_frames import RunwayConfig
 from systems.sensors.runway_camera import RunwayCameraConfig
-from systems.signals.measurement import Layout, no_measurement
 from systems.signals.runway_measurement import (
     ACT_OFFSET,
-    AIRSPEED,
-    ANTENNA,
     ATTITUDE_PERIOD,
-    BARO_INERTIAL,
-    FIX,
-    INERTIAL_NAVIGATION,
-    LASER_HEIGHT,
-    MAGNETIC_HEADING,
+    MEASUREMENTS,
     NAVIGATION_ESTIMATE,
-    PHASE_STATUS,
-    PICTURE,
-    WHEEL_SPEED,
 )
-
-# The inputs of both filters, so that one takes the other's place in the diagram.
-FILTER_INPUTS: tuple[tuple[str, Layout], ...] = (
-    ("inertial", INERTIAL_NAVIGATION),
-    ("baro", BARO_INERTIAL),
-    ("fix", FIX),
-    ("antenna", ANTENNA),
-    ("picture", PICTURE),
-    ("laser", LASER_HEIGHT),
-    ("phase", PHASE_STATUS),
-    ("heading", MAGNETIC_HEADING),
-    ("wheel_speed", WHEEL_SPEED),
-    ("airspeed", AIRSPEED),
-)
-_ALWAYS = frozenset(range(7))
-# the phases in which the thesis's filter looks at an input; reading a port costs time
-_USED_IN = (_ALWAYS, _ALWAYS, {0}, {1}, {2, 3}, {3})
-_NOTHING = tuple(no_measurement(layout) for _, layout in FILTER_INPUTS[:6])
-_READ_IN = [[index for index, used in enumerate(_USED_IN) if phase in used] for phase in range(7)]
 
 
 @configuration
@@ -109,32 +80,25 @@ class RunwayErrorFilter(LeafSystem):
 
         name: RunwayErrorFilter
         input_ports:
-        - inertial
-        - baro
-        - fix
-        - antenna
-        - picture
-        - laser
-        - phase
-        - heading
-        - wheel_speed
-        - airspeed
+        - measurements
         output_ports:
         - estimate
 
     | port | layout | meaning |
     |---|---|---|
-    | inertial | INERTIAL_NAVIGATION | position, speed and attitude, drifting |
-    | baro | BARO_INERTIAL | the vertical position |
-    | fix | FIX | used in Standby |
-    | antenna | ANTENNA | azimuth, used in Return |
-    | picture | PICTURE | the tracked touch-down point, used in Final |
-    | laser | LASER_HEIGHT | used in Final with laser |
-    | phase | PHASE_STATUS | which measurements count |
-    | heading | MAGNETIC_HEADING | (optional) not used by the thesis's filter |
-    | wheel_speed | WHEEL_SPEED | (optional) not used |
-    | airspeed | AIRSPEED | (optional) not used |
+    | measurements | MEASUREMENTS | the newest of each sensor, and the phase |
     | estimate | NAVIGATION_ESTIMATE | the corrected navigation |
+
+    | measurement | used |
+    |---|---|
+    | inertial | position, speed and attitude, drifting |
+    | baro | the vertical position |
+    | fix | in Standby |
+    | antenna | its azimuth, in Return |
+    | picture | the tracked touch-down point, in Final |
+    | laser | in Final with laser |
+    | phase | which of them count |
+    | heading, wheel_speed, airspeed | not by the thesis's filter |
 
     Equations: `systems.estimators.runway_error_filter_kernel`. The covariance is
     kept from phase to phase; when the laser is activated the altitude is reset,
@@ -153,9 +117,7 @@ class RunwayErrorFilter(LeafSystem):
     ):
         super().__init__()
         self.configure(config, seed, runway)
-        self._inputs = [
-            self.DeclareVectorInputPort(name, layout.size) for name, layout in FILTER_INPUTS
-        ]
+        self._measurements = self.DeclareVectorInputPort("measurements", MEASUREMENTS.size).Eval
         estimate = self.DeclareDiscreteState(NAVIGATION_ESTIMATE.size)
         self.DeclareDiscreteState(initial_memory())
         self.DeclareStateOutputPort("estimate", estimate)
@@ -176,15 +138,9 @@ class RunwayErrorFilter(LeafSystem):
         return self._parameters
 
     def _step(self, context, discrete_state):
-        phase = self._inputs[6].Eval(context)[0]
-        values = list(_NOTHING)
-        for index in _READ_IN[int(phase)]:
-            values[index] = self._inputs[index].Eval(context)
-        arguments = [
+        step(
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
-            *values,
-            phase,
+            self._measurements(context),
             self._parameters,
-        ]
-        step(*arguments)
+        )

@@ -28,6 +28,14 @@ from numba import njit
 
 from systems.estimators.runway_kalman import fuse, sight, write_covariance
 from systems.runway_frames import angles_from_pixel
+from systems.signals.runway_measurement import (
+    ANTENNA_AT,
+    BARO_AT,
+    FIX_AT,
+    LASER_AT,
+    PHASE_AT,
+    PICTURE_AT,
+)
 
 STATES = 5
 HISTORY = 128  # attitudes kept, 1.28 s
@@ -87,7 +95,7 @@ def attitude_at(memory, time):
 
 
 @njit(cache=True)
-def step(estimate, memory, inertial, baro, fix, antenna, picture, laser, phase, parameters):
+def step(estimate, memory, measurements, parameters):
     """One step of the filter, in place.
 
     Parameters
@@ -96,12 +104,14 @@ def step(estimate, memory, inertial, baro, fix, antenna, picture, laser, phase, 
         Layout `NAVIGATION_ESTIMATE`.
     memory : array, shape (MEMORY,)
         State, covariance, what was seen, attitudes.
-    inertial, baro, fix, antenna, picture, laser : arrays
-        The newest measurement of each sensor, by the layouts of those names.
-    phase : float
-        Index of the phase, 0 Standby to 6 at a standstill.
+    measurements : array
+        Layout `MEASUREMENTS`.
     parameters : array, shape (PARAMETERS,)
     """
+    inertial, baro = measurements[:BARO_AT], measurements[BARO_AT:FIX_AT]
+    fix, antenna = measurements[FIX_AT:ANTENNA_AT], measurements[ANTENNA_AT:PICTURE_AT]
+    picture, laser = measurements[PICTURE_AT:LASER_AT], measurements[LASER_AT:PHASE_AT]
+    phase = measurements[PHASE_AT]
     if inertial[3] == 0.0 or baro[3] == 0.0:
         return
     x = memory[_X:_P]
@@ -121,9 +131,10 @@ def step(estimate, memory, inertial, baro, fix, antenna, picture, laser, phase, 
     if estimate[1] == 0.0:
         return
 
-    if phase == 1.0 and antenna[3] > 0.0 and antenna[1] > memory[_SEEN + 1]:
-        _return(x, P, inertial, antenna, parameters)
-    memory[_SEEN + 1] = antenna[1]
+    if phase == 1.0:
+        if antenna[3] > 0.0 and antenna[1] > memory[_SEEN + 1]:
+            _return(x, P, inertial, antenna, parameters)
+        memory[_SEEN + 1] = antenna[1]
 
     final = phase == 2.0 or phase == 3.0
     with_laser = phase == 3.0 and laser[3] > 0.0 and laser[1] > memory[_SEEN + 3]
@@ -138,8 +149,10 @@ def step(estimate, memory, inertial, baro, fix, antenna, picture, laser, phase, 
             estimate, memory, x, P, inertial, z_imu, picture, laser, with_picture, with_laser,
             parameters,
         )  # fmt: skip
-    memory[_SEEN + 2] = picture[1]
-    memory[_SEEN + 3] = laser[1]
+    if final:
+        memory[_SEEN + 2] = picture[1]
+    if phase == 3.0:
+        memory[_SEEN + 3] = laser[1]
     memory[_PHASE] = phase
 
     estimate[0] = inertial[0]

@@ -8,36 +8,15 @@ from pydantic import Field
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from systems.configuration import Metres, NonNegative, Positive, Seconds, configuration
-from systems.estimators.runway_error_filter import FILTER_INPUTS
 from systems.estimators.runway_improved_filter_kernel import initial_memory, step
 from systems.runway_frames import RunwayConfig
 from systems.sensors.runway_camera import RunwayCameraConfig
-from systems.signals.measurement import no_measurement
 from systems.signals.runway_measurement import (
     ACT_OFFSET,
     ATTITUDE_PERIOD,
+    MEASUREMENTS,
     NAVIGATION_ESTIMATE,
 )
-
-_ALWAYS = frozenset(range(7))
-# the phases in which an input is looked at; reading a port costs time
-_USED_IN = (
-    _ALWAYS,
-    _ALWAYS,
-    {0},
-    {1, 2, 3, 4},
-    {2, 3, 4},
-    {3, 4},
-    _ALWAYS,
-    _ALWAYS,
-    {4, 5, 6},
-    {0, 1, 2, 3, 4},
-)
-_NOTHING = tuple(no_measurement(layout) for _, layout in FILTER_INPUTS)
-_READ_IN = [
-    [index for index, used in enumerate(_USED_IN) if phase in used and index != 6]
-    for phase in range(7)
-]
 
 
 @configuration
@@ -127,32 +106,27 @@ class RunwayImprovedFilter(LeafSystem):
 
         name: RunwayImprovedFilter
         input_ports:
-        - inertial
-        - baro
-        - fix
-        - antenna
-        - picture
-        - laser
-        - phase
-        - heading
-        - wheel_speed
-        - airspeed
+        - measurements
         output_ports:
         - estimate
 
     | port | layout | meaning |
     |---|---|---|
-    | inertial | INERTIAL_NAVIGATION | position, speed and attitude, drifting |
-    | baro | BARO_INERTIAL | the vertical position |
-    | fix | FIX | used in Standby |
-    | antenna | ANTENNA | azimuth and elevation, used in the air |
-    | picture | PICTURE | the tracked touch-down point, used from Final to touchdown |
-    | laser | LASER_HEIGHT | used from its activation to touchdown |
-    | phase | PHASE_STATUS | which measurements count |
-    | heading | MAGNETIC_HEADING | declination in the air, heading on the ground |
-    | wheel_speed | WHEEL_SPEED | used on the ground |
-    | airspeed | AIRSPEED | wind |
+    | measurements | MEASUREMENTS | the newest of each sensor, and the phase |
     | estimate | NAVIGATION_ESTIMATE | the corrected navigation |
+
+    | measurement | used |
+    |---|---|
+    | inertial | position, speed and attitude, drifting |
+    | baro | the vertical position |
+    | fix | in Standby |
+    | antenna | azimuth and elevation, from Return to touchdown |
+    | picture | the tracked touch-down point, from Final to touchdown |
+    | laser | from its activation to touchdown |
+    | phase | which of them count |
+    | heading | declination in the air, heading on the ground |
+    | wheel_speed | on the ground |
+    | airspeed | wind, in the air |
 
     Equations: `systems.estimators.runway_improved_filter_kernel`.
 
@@ -169,9 +143,7 @@ class RunwayImprovedFilter(LeafSystem):
     ):
         super().__init__()
         self.configure(config, seed, runway)
-        self._inputs = [
-            self.DeclareVectorInputPort(name, layout.size) for name, layout in FILTER_INPUTS
-        ]
+        self._measurements = self.DeclareVectorInputPort("measurements", MEASUREMENTS.size).Eval
         estimate = self.DeclareDiscreteState(NAVIGATION_ESTIMATE.size)
         self.DeclareDiscreteState(initial_memory())
         self.DeclareStateOutputPort("estimate", estimate)
@@ -192,15 +164,9 @@ class RunwayImprovedFilter(LeafSystem):
         return self._parameters
 
     def _step(self, context, discrete_state):
-        phase = self._inputs[6].Eval(context)[0]
-        values = list(_NOTHING)
-        for index in _READ_IN[int(phase)]:
-            values[index] = self._inputs[index].Eval(context)
-        values[6] = phase
-        arguments = [
+        step(
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
-            *values,
+            self._measurements(context),
             self._parameters,
-        ]
-        step(*arguments)
+        )

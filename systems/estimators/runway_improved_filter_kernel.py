@@ -40,6 +40,18 @@ from numba import njit
 
 from systems.estimators.runway_kalman import fuse, innovation_variance, sight, write_covariance
 from systems.runway_frames import EARTH_RADIUS, GRAVITY, angles_from_pixel, wrap_angle
+from systems.signals.runway_measurement import (
+    AIRSPEED_AT,
+    ANTENNA_AT,
+    BARO_AT,
+    FIX_AT,
+    HEADING_AT,
+    LASER_AT,
+    MEASUREMENTS_END,
+    PHASE_AT,
+    PICTURE_AT,
+    WHEELS_AT,
+)
 
 STATES = 13
 HISTORY = 128  # entries of inertial navigation kept, 1.28 s
@@ -143,21 +155,7 @@ def propagate(x, P, vertical_speed, dt, parameters):
 
 
 @njit(cache=True)
-def step(
-    estimate,
-    memory,
-    inertial,
-    baro,
-    fix,
-    antenna,
-    picture,
-    laser,
-    phase,
-    heading,
-    wheels,
-    airspeed,
-    parameters,
-):
+def step(estimate, memory, measurements, parameters):
     """One step of the filter, in place.
 
     Parameters
@@ -165,14 +163,16 @@ def step(
     estimate : array
         Layout `NAVIGATION_ESTIMATE`.
     memory : array, shape (MEMORY,)
-    inertial, baro, fix, antenna, picture, laser : arrays
-        The newest measurement of each sensor.
-    phase : float
-        Index of the phase.
-    heading, wheels, airspeed : arrays
-        The newest measurement of compass, wheel encoder and air data.
+    measurements : array
+        Layout `MEASUREMENTS`.
     parameters : array, shape (PARAMETERS,)
     """
+    inertial, baro = measurements[:BARO_AT], measurements[BARO_AT:FIX_AT]
+    fix, antenna = measurements[FIX_AT:ANTENNA_AT], measurements[ANTENNA_AT:PICTURE_AT]
+    picture, laser = measurements[PICTURE_AT:LASER_AT], measurements[LASER_AT:PHASE_AT]
+    phase, heading = measurements[PHASE_AT], measurements[HEADING_AT:WHEELS_AT]
+    wheels = measurements[WHEELS_AT:AIRSPEED_AT]
+    airspeed = measurements[AIRSPEED_AT:MEASUREMENTS_END]
     if inertial[3] == 0.0 or baro[3] == 0.0:
         return
     x = memory[_X:_P]
@@ -193,30 +193,34 @@ def step(
         propagate(x, P, inertial[9], now - memory[_PROPAGATED], parameters)
     memory[_PROPAGATED] = now
 
-    if fix[3] > 0.0 and fix[1] > memory[_SEEN]:
+    if phase == 0.0 and fix[3] > 0.0 and fix[1] > memory[_SEEN]:
         memory[_SEEN] = fix[1]
         _fuse_fix(estimate, memory, x, P, inertial, fix, parameters)
     if estimate[1] == 0.0:
         return
 
-    if phase >= 1.0 and wheels[3] <= 0.0 and antenna[3] > 0.0 and antenna[1] > memory[_SEEN + 1]:
-        _fuse_antenna(estimate, memory, x, P, antenna, now, parameters)
-    memory[_SEEN + 1] = antenna[1]
-    if 2.0 <= phase < 5.0 and picture[3] > 0.0 and picture[1] > memory[_SEEN + 2]:
-        _fuse_picture(estimate, memory, x, P, picture, now, parameters)
-    memory[_SEEN + 2] = picture[1]
-    if 3.0 <= phase < 5.0 and laser[3] > 0.0 and laser[1] > memory[_SEEN + 3]:
-        _fuse_laser(estimate, memory, x, P, laser, now, parameters)
-    memory[_SEEN + 3] = laser[1]
+    on_ground = phase >= 4.0 and wheels[3] > 0.0
+    if 1.0 <= phase < 5.0:
+        if not on_ground and antenna[3] > 0.0 and antenna[1] > memory[_SEEN + 1]:
+            _fuse_antenna(estimate, memory, x, P, antenna, now, parameters)
+        memory[_SEEN + 1] = antenna[1]
+    if 2.0 <= phase < 5.0:
+        if picture[3] > 0.0 and picture[1] > memory[_SEEN + 2]:
+            _fuse_picture(estimate, memory, x, P, picture, now, parameters)
+        memory[_SEEN + 2] = picture[1]
+    if 3.0 <= phase < 5.0:
+        if laser[3] > 0.0 and laser[1] > memory[_SEEN + 3]:
+            _fuse_laser(estimate, memory, x, P, laser, now, parameters)
+        memory[_SEEN + 3] = laser[1]
     yaw = inertial[11]
     if heading[1] > memory[_SEEN + 4]:
         memory[_SEEN + 4] = heading[1]
-        if wheels[3] <= 0.0:
+        if not on_ground:
             count = min(memory[_DECLINATION + 1] + 1.0, 2000.0)
             memory[_DECLINATION + 1] = count
             gap = wrap_angle(yaw - heading[4] - memory[_DECLINATION])
             memory[_DECLINATION] = wrap_angle(memory[_DECLINATION] + gap / count)
-    if airspeed[3] > 0.0 and airspeed[1] > memory[_SEEN + 6]:
+    if phase < 5.0 and airspeed[3] > 0.0 and airspeed[1] > memory[_SEEN + 6]:
         memory[_SEEN + 6] = airspeed[1]
         count = min(memory[_WINDS] + 1.0, 250.0)
         memory[_WINDS] = count
@@ -225,11 +229,11 @@ def step(
         wind_e = inertial[8] - x[4] - level * math.sin(yaw)
         estimate[38] += (wind_n - estimate[38]) / count
         estimate[39] += (wind_e - estimate[39]) / count
-    if wheels[3] > 0.0 and wheels[1] > memory[_SEEN + 5]:
+    if on_ground and wheels[1] > memory[_SEEN + 5]:
         # inertial navigation and compass, the latter freed of its declination in flight
         magnetic = wrap_angle(heading[4] + memory[_DECLINATION] - yaw)
         _fuse_wheels(estimate, memory, x, P, inertial, wheels, yaw + 0.5 * magnetic, parameters)
-    memory[_SEEN + 5] = wheels[1]
+        memory[_SEEN + 5] = wheels[1]
 
     estimate[0] = now
     estimate[2] = entry[1] - x[0]

@@ -186,9 +186,9 @@ class RunwayRecord(LeafSystem):
         super().__init__()
         self._config = config
         self.configure(config, seed, runway, time_limit)
-        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
-        self._estimate = self.DeclareVectorInputPort("estimate", NAVIGATION_ESTIMATE.size)
-        self._phase = self.DeclareVectorInputPort("phase", PHASE_STATUS.size)
+        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size).Eval
+        self._estimate = self.DeclareVectorInputPort("estimate", NAVIGATION_ESTIMATE.size).Eval
+        self._phase = self.DeclareVectorInputPort("phase", PHASE_STATUS.size).Eval
         passages = self.DeclareDiscreteState(
             np.full(len(config.distances) * PASSAGE.size, math.nan)
         )
@@ -218,17 +218,18 @@ class RunwayRecord(LeafSystem):
         self._time_limit = time_limit
 
     def _note(self, context, discrete_state):
+        time = context.get_time()
         passages = discrete_state.get_mutable_value(0)
         note(
             passages.reshape(len(self._distances), PASSAGE.size),
             discrete_state.get_mutable_value(1),
-            self._state.Eval(context),
-            self._estimate.Eval(context),
-            self._phase.Eval(context)[0],
+            self._state(context),
+            self._estimate(context),
+            self._phase(context)[0],
             self._distances,
             self._heading,
-            context.get_time(),
+            time,
         )
-        if context.get_time() >= self._time_limit:
+        if time >= self._time_limit:
             return EventStatus.ReachedTermination(self, "time limit")
-        return EventStatus.Succeeded()
+        return None

@@ -159,7 +159,7 @@ class RunwayInertialDrift(LeafSystem):
     ):
         super().__init__()
         self.configure(config, seed, runway)
-        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
+        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size).Eval
         output = self.DeclareDiscreteState(no_measurement(INERTIAL_NAVIGATION))
         self.DeclareDiscreteState(7)
         self.DeclareStateOutputPort("measurement", output)
@@ -196,7 +196,7 @@ class RunwayInertialDrift(LeafSystem):
         inertial_sample(
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
-            self._state.Eval(context),
+            self._state(context),
             context.get_time(),
             self._parameters,
             ATTITUDE_PERIOD,

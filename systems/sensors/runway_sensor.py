@@ -11,6 +11,7 @@ the spread that the configuration declares, as the Monte Carlo simulations of
 the thesis do (Leonard 2016, 5.3): a campaign is one scenario and many seeds.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ class RunwaySensor(LeafSystem):
         self._config = config
         self._event_period = self.look
         self.configure(config, seed, runway)
-        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
+        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size).Eval
         output = self.DeclareDiscreteState(no_measurement(self.layout))
         self.DeclareDiscreteState(2 + self.capacity * (self.layout.size + 1))
         self.DeclareStateOutputPort("measurement", output)
@@ -81,6 +82,8 @@ class RunwaySensor(LeafSystem):
         self._config = config
         self._every = max(round(config.period / self.look), 1)
         self._delay = getattr(config, "delay", 0.0)
+        # looks after a sample: at it, and when a measurement comes out
+        self._awake = {0, math.ceil((self._delay - 1e-9) / self.look) % self._every}
         self._runway = runway or RunwayConfig()
         self._key = stream_key(seed, self.stream)
         self._parameters = np.asarray(self._draw(config, seed), dtype=float)
@@ -98,15 +101,14 @@ class RunwaySensor(LeafSystem):
 
     def _update(self, context, discrete_state):
         time = context.get_time()
-        sampling = round(time / self.look) % self._every == 0
-        if not (sampling or self._delay):
+        index, since = divmod(round(time / self.look), self._every)
+        if since not in self._awake:
+            return
+        output = discrete_state.get_mutable_value(0)
+        if self._delay == 0.0:
+            output[:] = self._sample(self._state(context), time, index)
             return
         pipeline = discrete_state.get_mutable_value(1)
-        if not sampling and pipeline[1] == 0.0:
-            return
-        if sampling:
-            index = int(pipeline[0])
-            pipeline[0] += 1.0
-            message = self._sample(self._state.Eval(context), time, index)
-            enqueue(pipeline, message, time + self._delay)
-        release(pipeline, discrete_state.get_mutable_value(0), time)
+        if since == 0:
+            enqueue(pipeline, self._sample(self._state(context), time, index), time + self._delay)
+        release(pipeline, output, time)

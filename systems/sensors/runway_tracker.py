@@ -127,8 +127,8 @@ class RunwayTracker(LeafSystem):
     ):
         super().__init__()
         self.configure(config, seed)
-        self._picture = self.DeclareVectorInputPort("picture", PICTURE.size)
-        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size)
+        self._picture = self.DeclareVectorInputPort("picture", PICTURE.size).Eval
+        self._state = self.DeclareVectorInputPort("state", FIXED_WING_STATE.size).Eval
         output = self.DeclareDiscreteState(no_measurement(PICTURE))
         self.DeclareDiscreteState(2 + PICTURES_UNDER_WAY * (PICTURE.size + 1))
         self.DeclareStateOutputPort("measurement", output)
@@ -159,12 +159,12 @@ class RunwayTracker(LeafSystem):
         return self._parameters, self._key, self._config.delay
 
     def _update(self, context, discrete_state):
-        picture = self._picture.Eval(context)
+        picture = self._picture(context)
         pipeline = discrete_state.get_mutable_value(1)
         time = context.get_time()
         if picture[2] + 1.0 > pipeline[0]:  # a sequence number not seen yet
             pipeline[0] = picture[2] + 1.0
-            state = self._state.Eval(context)
+            state = self._state(context)
             distance = math.hypot(state[0], state[1])
             found = track(picture, distance, time, self._parameters, self._key)
             # the picture leaves the camera at its time stamp, the tracker `delay` later

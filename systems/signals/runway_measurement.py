@@ -16,9 +16,12 @@ no diagram with the multirotor.
 | estimate and act | 5 ms | tracker, filter, flight controller |
 """
 
+from itertools import accumulate
+
+import numpy as np
 from numba import njit
 
-from systems.signals.measurement import Layout, measurement_layout, vector
+from systems.signals.measurement import Layout, measurement_layout, no_measurement, vector
 
 ATTITUDE_PERIOD = 0.01  # s, IMU attitude and filter, 100 Hz (Table 3)
 NAVIGATION_PERIOD = 0.02  # s, IMU position and speed, baro, flight controller, 50 Hz (Table 3)
@@ -149,6 +152,39 @@ PHASE_STATUS = Layout(
     ),
 )
 
+# What the filter works on: the newest measurement of each sensor, and the phase, one after the
+# other in one port, because reading ten ports costs a Python system ten microseconds.
+FILTER_INPUTS: tuple[tuple[str, Layout], ...] = (
+    ("inertial", INERTIAL_NAVIGATION),
+    ("baro", BARO_INERTIAL),
+    ("fix", FIX),
+    ("antenna", ANTENNA),
+    ("picture", PICTURE),
+    ("laser", LASER_HEIGHT),
+    ("phase", PHASE_STATUS),
+    ("heading", MAGNETIC_HEADING),
+    ("wheel_speed", WHEEL_SPEED),
+    ("airspeed", AIRSPEED),
+)
+MEASUREMENTS = Layout(
+    "Measurements",
+    tuple(f"{name}_{field}" for name, layout in FILTER_INPUTS for field in layout.fields),
+)
+# where each of them begins, and the end: the baro's are the entries BARO_AT to FIX_AT
+(
+    BARO_AT, FIX_AT, ANTENNA_AT, PICTURE_AT, LASER_AT, PHASE_AT, HEADING_AT, WHEELS_AT,
+    AIRSPEED_AT, MEASUREMENTS_END,
+) = accumulate(layout.size for _, layout in FILTER_INPUTS)  # fmt: skip
+
+
+def no_measurements() -> np.ndarray:
+    """What stands in `MEASUREMENTS` before the first samples, shape (MEASUREMENTS.size,)."""
+    first = [
+        layout.zeros() if layout is PHASE_STATUS else no_measurement(layout)
+        for _, layout in FILTER_INPUTS
+    ]
+    return np.concatenate(first)
+
 
 @njit(cache=True)
 def enqueue(pipeline, message, ready):
@@ -157,8 +193,8 @@ def enqueue(pipeline, message, ready):
     Parameters
     ----------
     pipeline : array, shape (2 + capacity * (size + 1),)
-        `[sample counter, count, (ready, message …) …]`, the oldest first. When
-        it is full the newest message is lost.
+        `[a number of its owner's, count, (ready, message …) …]`, the oldest first.
+        When it is full the newest message is lost.
     message : array, shape (size,)
     ready : float
     """

@@ -1,10 +1,12 @@
 """The phases of the landing without GPS (Leonard 2016, 2.3 and 4.2)."""
 
 import math
+from collections.abc import Callable
 from enum import IntEnum
 from types import SimpleNamespace
 
-from pydrake.systems.framework import DiagramBuilder, EventStatus, InputPort, LeafSystem
+import numpy as np
+from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 
 from systems.configuration import Metres, NonNegative, Seconds, configuration
 from systems.signals.runway_measurement import (
@@ -125,7 +127,7 @@ class RunwayPhases(LeafSystem):
     def __init__(self, config: RunwayPhasesConfig, seed: int = 0):
         super().__init__()
         self.configure(config, seed)
-        self._inputs: list[InputPort] = []
+        self._inputs: list[Callable[[Context], np.ndarray]] = []
         for name, layout in (
             ("estimate", NAVIGATION_ESTIMATE),
             ("guidance", GUIDANCE),
@@ -134,7 +136,7 @@ class RunwayPhases(LeafSystem):
             ("picture", PICTURE),
             ("wheel_speed", WHEEL_SPEED),
         ):
-            self._inputs.append(self.DeclareVectorInputPort(name, layout.size))
+            self._inputs.append(self.DeclareVectorInputPort(name, layout.size).Eval)
         status = self.DeclareDiscreteState(PHASE_STATUS.size)
         self.DeclareDiscreteState([0.0])  # s, when the tracker last had the point
         self.DeclareStateOutputPort("status", status)
@@ -182,7 +184,7 @@ class RunwayPhases(LeafSystem):
         time = context.get_time()
 
         def read(port):
-            return self._inputs[port].Eval(context)
+            return self._inputs[port](context)
 
         if status[0] == _STANDBY:
             fix = read(2)
@@ -197,4 +199,4 @@ class RunwayPhases(LeafSystem):
         status[3] = float(after == _STANDSTILL)
         if after == _STANDSTILL and status[1] >= self._config.settle:
             return EventStatus.ReachedTermination(self, "at a standstill")
-        return EventStatus.Succeeded()
+        return None

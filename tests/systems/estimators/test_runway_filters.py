@@ -20,18 +20,7 @@ from systems.estimators.runway_record import (
 )
 from systems.runway_frames import RunwayConfig, ned_from_runway, pixel_from_angles
 from systems.signals.measurement import no_measurement
-from systems.signals.runway_measurement import (
-    AIRSPEED,
-    ANTENNA,
-    BARO_INERTIAL,
-    FIX,
-    INERTIAL_NAVIGATION,
-    LASER_HEIGHT,
-    MAGNETIC_HEADING,
-    NAVIGATION_ESTIMATE,
-    PICTURE,
-    WHEEL_SPEED,
-)
+from systems.signals.runway_measurement import FILTER_INPUTS, NAVIGATION_ESTIMATE
 from systems.supervisors.runway_phases import Phase
 from tests.runway_bench import assert_contract
 from tests.system_contract import periodic_update
@@ -39,17 +28,7 @@ from tests.system_contract import periodic_update
 RUNWAY = RunwayConfig()
 HEADING = RUNWAY.heading_radians
 BOTH = pytest.mark.parametrize("kind", ["thesis", "improved"])
-LAYOUTS = {
-    "inertial": INERTIAL_NAVIGATION,
-    "baro": BARO_INERTIAL,
-    "fix": FIX,
-    "antenna": ANTENNA,
-    "picture": PICTURE,
-    "laser": LASER_HEIGHT,
-    "heading": MAGNETIC_HEADING,
-    "wheels": WHEEL_SPEED,
-    "airspeed": AIRSPEED,
-}
+LAYOUTS = dict(FILTER_INPUTS)
 
 
 class Flight:
@@ -107,14 +86,9 @@ class Flight:
             )  # fmt: skip
         self.inputs["inertial"][10:14] = (self.time, HEADING, -0.05, 0.0)
         self.give("baro", -self.p_n[2] - self.error[2])
-        names = ("inertial", "baro", "fix", "antenna", "picture", "laser")
-        extra = ("heading", "wheels", "airspeed") if self.kind == "improved" else ()
-        arguments = [
-            *(self.inputs[n] for n in names),
-            float(phase),
-            *(self.inputs[n] for n in extra),
-        ]
-        self.kernel_step(self.estimate, self.memory, *arguments, self.parameters)
+        self.inputs["phase"] = np.array([float(phase), 0.0, 0.0, 0.0])
+        measurements = np.concatenate([self.inputs[name] for name, _ in FILTER_INPUTS])
+        self.kernel_step(self.estimate, self.memory, measurements, self.parameters)
         self.tick += 1
         self.time = self.tick * 0.01
         self.error[:2] += 0.01 * self.error[3:5]
@@ -347,7 +321,7 @@ def test_wheels_hold_the_speed_on_the_ground():
     flight.step(Phase.STANDBY)
     speed = np.hypot(*flight.v_n[:2])
     for _ in range(60):
-        flight.give("wheels", speed)
+        flight.give("wheel_speed", speed)
         flight.give("heading", HEADING)
         flight.run(0.08, Phase.BRAKING, pictures=False)
     np.testing.assert_allclose(flight.estimate[5:7], flight.v_n[:2], atol=0.12)

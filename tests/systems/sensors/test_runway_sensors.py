@@ -119,6 +119,15 @@ def test_antenna_angles():
     np.testing.assert_allclose(out[0, 4:6], (math.pi / 2, math.pi / 4))
 
 
+@pytest.mark.parametrize(("delay", "late"), [(0.0, 0.0), (0.1, 0.12), (0.2, 0.2), (1.3, 1.32)])
+def test_a_measurement_comes_out_at_the_first_look_after_its_delay(delay, late):
+    """The antenna samples every second and looks every 40 ms."""
+    samples = arrivals(RunwayAntenna(RunwayAntennaConfig(delay=delay)), {"state": state()}, 5.1)
+    assert len(samples) >= 4
+    np.testing.assert_allclose(samples[:, 0], np.arange(len(samples)), atol=1e-9)
+    np.testing.assert_allclose(samples[:, 1] - samples[:, 0], late, atol=1e-9)
+
+
 def test_camera_sees_the_touchdown_point_on_its_axis():
     """On a path of 6 deg with the mounting's 3 deg and a pitch of −3 deg it is in the centre."""
     config = RunwayCameraConfig(
