@@ -1,6 +1,7 @@
 """Graphs of diagrams: DOT always, SVG and PNG where Graphviz's `dot` is installed."""
 
 import shutil
+import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -93,5 +94,8 @@ def _parse(dot: str) -> pydot.Dot:
 
 
 def _draw(dot: str, drawing: str) -> bytes:
-    drawn = _parse(dot).create(format=drawing)
-    return drawn if isinstance(drawn, bytes) else drawn.encode()
+    command = ["dot", f"-T{drawing}"]
+    try:
+        return subprocess.run(command, input=dot.encode(), capture_output=True, check=True).stdout
+    except subprocess.CalledProcessError as error:
+        raise GraphError(f"dot: {error.stderr.decode().strip()}") from None

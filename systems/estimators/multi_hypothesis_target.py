@@ -11,7 +11,7 @@ from pydrake.systems.framework import (
     DiscreteValues,
     LeafSystem,
 )
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from plants.svgs_beacons import SvgsBeaconsConfig
 from systems.configuration import (
@@ -280,7 +280,7 @@ class MultiHypothesisTarget(LeafSystem):
                      "marker_odds_limit", "known_radius", "known_slope", "forget_radius",
                      "forget_slope", "forget_time"):  # fmt: skip
             setattr(k, name, getattr(c, name))
-        k.gate_2, k.gate_3 = chi2.ppf(c.gate_probability, (2, 3))
+        k.gate_2, k.gate_3 = chdtri((2, 3), 1.0 - c.gate_probability)  # chi-square quantiles
         k.late_odds = float(np.log(c.late_probability))
         k.latitude, k.longitude, k.altitude = s.origin
         self._parameters = k[:]
