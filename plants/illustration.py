@@ -38,13 +38,15 @@ from plants.svgs_beacons import BEACON_NAMES, COLOURS, SvgsBeaconsConfig
 from plants.vehicles import Vehicle
 from systems.signals.measurement import BODY_STATE, PAD_STATE
 
-_CARBON = Rgba(0.12, 0.13, 0.15, 1.0)
+# Of every vehicle
+CARBON = Rgba(0.12, 0.13, 0.15, 1.0)
+FRONT = Rgba(0.93, 0.33, 0.12, 1.0)
+RUBBER = Rgba(0.05, 0.05, 0.05, 1.0)
+
 _SHELL = Rgba(0.86, 0.88, 0.90, 1.0)
 _METAL = Rgba(0.55, 0.57, 0.60, 1.0)
-_FRONT = Rgba(0.93, 0.33, 0.12, 1.0)
 _REAR = Rgba(0.16, 0.42, 0.70, 1.0)
 _BATTERY = Rgba(0.93, 0.73, 0.16, 1.0)
-_RUBBER = Rgba(0.05, 0.05, 0.05, 1.0)
 _GRASS = Rgba(0.45, 0.55, 0.38, 1.0)
 _BOARD = Rgba(0.97, 0.97, 0.96, 1.0)
 _INK = Rgba(0.03, 0.03, 0.03, 1.0)
@@ -91,25 +93,25 @@ def vehicle_pieces(vehicle: Vehicle) -> list[Piece]:
     hull = 0.3 * span
     pieces = [
         Piece("hull", Ellipsoid(hull, 0.85 * hull, 0.42 * hull), _at(0, 0, deck), _SHELL),
-        Piece("plate", Cylinder(1.1 * hull, 0.008), _at(0, 0, deck), _CARBON),
+        Piece("plate", Cylinder(1.1 * hull, 0.008), _at(0, 0, deck), CARBON),
         Piece(
             "battery",
             Box(1.3 * hull, 0.6 * hull, 0.3 * hull),
             _at(-0.1 * hull, 0, deck + 0.45 * hull),
             _BATTERY,
         ),
-        Piece("nose", Sphere(0.22 * hull), _at(0.92 * hull, 0, deck), _FRONT),
-        Piece("mast", Cylinder(0.006, 0.6 * hull), _at(-0.8 * hull, 0, deck + 0.5 * hull), _CARBON),
-        Piece("gnss", Cylinder(0.25 * hull, 0.02), _at(-0.8 * hull, 0, deck + 0.8 * hull), _CARBON),
+        Piece("nose", Sphere(0.22 * hull), _at(0.92 * hull, 0, deck), FRONT),
+        Piece("mast", Cylinder(0.006, 0.6 * hull), _at(-0.8 * hull, 0, deck + 0.5 * hull), CARBON),
+        Piece("gnss", Cylinder(0.25 * hull, 0.02), _at(-0.8 * hull, 0, deck + 0.8 * hull), CARBON),
         Piece("cameras", Box(0.05, 0.07, 0.03), _at(0, 0, deck - 0.5 * hull), _INK),
     ]
     for i, hub in enumerate(hubs):
-        colour = _FRONT if hub[0] > 0.3 * span else _REAR
+        colour = FRONT if hub[0] > 0.3 * span else _REAR
         disc = Rgba(colour.r(), colour.g(), colour.b(), 0.28)
         foot = np.array([0.0, 0.0, deck])
         end = np.array([hub[0], hub[1], deck])
         pieces += [
-            _rod(f"arm{i}", foot, end, 0.022 * span + 0.004, _CARBON),
+            _rod(f"arm{i}", foot, end, 0.022 * span + 0.004, CARBON),
             Piece(f"motor{i}", Cylinder(0.014 + 0.02 * span, 0.035), _at(*end), _METAL),
             Piece(f"disc{i}", Cylinder(vehicle.rotor_radius, 0.003), _at(*hub), disc),
             Piece(f"cap{i}", Cylinder(0.012, 0.014), _at(*hub), colour),
@@ -117,7 +119,7 @@ def vehicle_pieces(vehicle: Vehicle) -> list[Piece]:
     feet = np.array(vehicle.feet)
     for i, foot in enumerate(feet):
         top = np.array([0.45 * foot[0], 0.45 * foot[1], deck - 0.02])
-        pieces.append(_rod(f"leg{i}", top, foot + np.array([0.0, 0.0, 0.012]), 0.008, _CARBON))
+        pieces.append(_rod(f"leg{i}", top, foot + np.array([0.0, 0.0, 0.012]), 0.008, CARBON))
     for side in (1.0, -1.0):
         skid = feet[feet[:, 1] * side > 0.0]
         if len(skid) >= 2:
@@ -125,7 +127,7 @@ def vehicle_pieces(vehicle: Vehicle) -> list[Piece]:
             over = np.array([0.05, 0.0, 0.0])
             lift = np.array([0.0, 0.0, 0.01])
             name = "skid_left" if side > 0.0 else "skid_right"
-            pieces.append(_rod(name, first + over + lift, last - over + lift, 0.01, _RUBBER))
+            pieces.append(_rod(name, first + over + lift, last - over + lift, 0.01, RUBBER))
     return pieces
 
 
@@ -167,7 +169,7 @@ def pad_pieces(pad: PadConfig, svgs_beacons: SvgsBeaconsConfig | None = None) ->
     middle = -0.5 * _BOARD_THICKNESS
     pieces = [
         Piece("board", Box(side, side, _BOARD_THICKNESS), _at(0, 0, middle), _BOARD),
-        Piece("rim", Box(1.06 * side, 1.06 * side, 0.018), _at(0, 0, middle - 0.002), _FRONT),
+        Piece("rim", Box(1.06 * side, 1.06 * side, 0.018), _at(0, 0, middle - 0.002), FRONT),
     ]
     if pad.marker is not None:
         pieces += marker_pieces(pad.marker)

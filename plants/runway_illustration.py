@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, Ellipsoid, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from plants.illustration import Piece
+from plants.illustration import CARBON, FRONT, RUBBER, Piece
 from plants.terrain import Terrain
 from systems.runway_frames import RunwayConfig, angles_from_pixel, ned_from_runway, rotation
 from systems.signals.runway_measurement import (
@@ -25,10 +25,7 @@ from systems.signals.runway_measurement import (
 )
 
 _SHELL = Rgba(0.92, 0.93, 0.94, 1.0)
-_CARBON = Rgba(0.12, 0.13, 0.15, 1.0)
 _GLASS = Rgba(0.16, 0.22, 0.30, 1.0)
-_FRONT = Rgba(0.93, 0.33, 0.12, 1.0)
-_RUBBER = Rgba(0.05, 0.05, 0.05, 1.0)
 _DISC = Rgba(0.2, 0.2, 0.2, 0.18)
 _GHOST = Rgba(0.20, 0.62, 0.92, 0.45)  # the colour of the estimate in the plots
 _ASPHALT = Rgba(0.42, 0.43, 0.46, 1.0)
@@ -82,11 +79,11 @@ def aircraft_pieces(gear: float) -> list[Piece]:
         Piece("fuselage", Ellipsoid(3.3, 0.55, 0.62), _at(0.3, 0, 0), _SHELL),
         Piece("boom", Capsule(0.24, 4.6), _at(-2.9, 0, -0.12, pitch=quarter), _SHELL),
         Piece("canopy", Ellipsoid(1.15, 0.42, 0.42), _at(1.2, 0, -0.38), _GLASS),
-        Piece("spinner", Ellipsoid(0.45, 0.24, 0.24), _at(3.5, 0, 0), _FRONT),
+        Piece("spinner", Ellipsoid(0.45, 0.24, 0.24), _at(3.5, 0, 0), FRONT),
         Piece("propeller", Cylinder(0.95, 0.02), _at(3.55, 0, 0, pitch=quarter), _DISC),
-        Piece("fin", Ellipsoid(0.62, 0.07, 0.95), _at(-5.0, 0, -0.85, pitch=-0.25), _FRONT),
+        Piece("fin", Ellipsoid(0.62, 0.07, 0.95), _at(-5.0, 0, -0.85, pitch=-0.25), FRONT),
         Piece("tailplane", Ellipsoid(0.42, 1.75, 0.05), _at(-5.25, 0, -1.72), _SHELL),
-        Piece("turret", Sphere(0.24), _at(2.5, 0, 0.5), _CARBON),
+        Piece("turret", Sphere(0.24), _at(2.5, 0, 0.5), CARBON),
     ]
     for side, name in ((-1.0, "left"), (1.0, "right")):
         pieces += [
@@ -100,14 +97,14 @@ def aircraft_pieces(gear: float) -> list[Piece]:
                 f"{name} winglet",
                 Ellipsoid(0.28, 0.05, 0.42),
                 _at(0.0, side * 8.85, -0.9, roll=side * 0.25, pitch=-0.2),
-                _FRONT,
+                FRONT,
             ),
             Piece(f"{name} pod", Ellipsoid(0.95, 0.22, 0.24), _at(0.6, side * 2.9, 0.12), _SHELL),
         ]
     for name, x, y in (("left", -0.3, -1.25), ("right", -0.3, 1.25), ("nose", 2.2, 0.0)):
         pieces += [
             Piece(
-                f"{name} wheel", Cylinder(0.2, 0.14), _at(x, y, gear - 0.2, roll=quarter), _RUBBER
+                f"{name} wheel", Cylinder(0.2, 0.14), _at(x, y, gear - 0.2, roll=quarter), RUBBER
             ),
             Piece(
                 f"{name} strut", Box(0.1, 0.05, gear - 0.2), _at(x, y, 0.5 * (gear - 0.2)), _METAL
