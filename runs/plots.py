@@ -45,6 +45,9 @@ class RunPlots:
         self.states = [state.replace("_", " ") for state in states]
         self.body = port_samples(log, "body")
         self.supervisor = port_samples(log, "supervisor")
+        pad = port_samples(log, "pad")
+        self.pad = np.column_stack([pad["p_WP_x"], pad["p_WP_y"], pad["p_WP_z"]])
+        self._pad_time = pad["time"]
         self.end = float(self.body["time"][-1])
         self.time_range = Range1d(0.0, self.end, bounds=(0.0, self.end))
 
@@ -75,6 +78,11 @@ class RunPlots:
         except KeyError:
             return None
         return samples if len(samples["time"]) else None
+
+    def from_pad(self, time: np.ndarray, axis: str) -> np.ndarray:
+        """One coordinate of the vehicle from the pad's centre at each time (s), m."""
+        body = np.interp(time, self.body["time"], self.body[f"p_WB_{axis}"])
+        return body - np.interp(time, self._pad_time, self.pad[:, "xyz".index(axis)])
 
     # ------------------------------------------------------------ in the plane
 
@@ -113,21 +121,24 @@ class RunPlots:
         plot.add_tools(
             HoverTool(renderers=[line], tooltips=[("t", "@t{0.0} s"), ("z", "@z{0.00} m")])
         )
-        self._pad(plot)
+        if np.ptp(self.pad[:, :2], axis=0).max() > 0.0:
+            plot.line(*self.pad[:, :2].T, color=INK, line_width=1.5, legend_label="pad")
+        self._rings(plot, *self.pad[-1, :2])
         return finish_figure(plot)
 
     def final_approach(self) -> figure:
-        """The last metres above the pad, from above."""
+        """The last metres above the pad, from above and from the pad."""
         plot = blank_figure(
             "Last two metres of descent", "east (m)", "north (m)", match_aspect=True, height=420
         )
-        low = (self.body["p_WB_z"] < 2.0) & (
-            self.body["time"] >= self._landing_started() if self._landing_started() >= 0 else False
+        time = self.body["time"]
+        low = (self.from_pad(time, "z") < 2.0) & (
+            time >= self._landing_started() if self._landing_started() >= 0 else False
         )
-        self._pad(plot)
+        self._rings(plot, 0.0, 0.0)
         plot.line(
-            self.body["p_WB_x"][low],
-            self.body["p_WB_y"][low],
+            self.from_pad(time, "x")[low],
+            self.from_pad(time, "y")[low],
             color=BLUE,
             line_width=2,
             legend_label="truth",
@@ -146,20 +157,21 @@ class RunPlots:
             )
         return finish_figure(plot)
 
-    def _pad(self, plot: figure) -> None:
+    def _rings(self, plot: figure, x: float, y: float) -> None:
+        """The pad, with distances from it."""
         for radius in (0.1, 0.5, 1.0):
-            plot.circle(0.0, 0.0, radius=radius, fill_alpha=0.0, line_color="#b9bdc7", line_width=1)
+            plot.circle(x, y, radius=radius, fill_alpha=0.0, line_color="#b9bdc7", line_width=1)
             plot.add_layout(
                 Label(
-                    x=0.0,
-                    y=radius,
+                    x=x,
+                    y=y + radius,
                     text=f"{radius:g} m",
                     text_font_size="8pt",
                     text_color="#8a8f9c",
                     text_align="center",
                 )
             )
-        plot.scatter([0.0], [0.0], marker="square", size=7, color=INK, legend_label="pad")
+        plot.scatter([x], [y], marker="square", size=7, color=INK, legend_label="pad")
 
     def _landing_started(self) -> float:
         return float(self.supervisor["landing_started"][-1])
@@ -233,8 +245,7 @@ class RunPlots:
         used = target["acquired"] > 0.5
         time = target["time"][used]
         for axis, name, colour in (("x", "east", BLUE), ("y", "north", ORANGE)):
-            truth = -np.interp(time, self.body["time"], self.body[f"p_WB_{axis}"])
-            error = target[f"p_BP_W_{axis}"][used] - truth
+            error = target[f"p_BP_W_{axis}"][used] + self.from_pad(time, axis)
             sigma = np.sqrt(target[f"position_variance_{axis}"][used])
             uncertainty_band(plot, time, np.zeros_like(time), 3.0 * sigma, colour)
             plot.line(time, error, color=colour, line_width=1.5, legend_label=f"{name}, 3 σ")
@@ -255,10 +266,15 @@ class RunPlots:
         infrared = self.port("infrared")
         if infrared is not None:
             rows.append(("IR beacon", infrared["time"][infrared["valid"] > 0.5], RED))
-        for name, label in (("range_finder", "range finder"), ("gnss", "GNSS")):
+        for name, label, colour in (
+            ("svgs", "SVGS", GREEN),
+            ("range_finder", "range finder", BLUE),
+            ("gnss", "GNSS", BLUE),
+            ("pad_gnss", "pad's GNSS", BLUE),
+        ):
             samples = self.port(name)
             if samples is not None:
-                rows.append((label, samples["time"][samples["valid"] > 0.5], BLUE))
+                rows.append((label, samples["time"][samples["valid"] > 0.5], colour))
         target = self.port("target")
         if target is not None:
             rows.append(("target acquired", target["time"][target["acquired"] > 0.5], PURPLE))
