@@ -34,7 +34,7 @@ from rich.text import Text
 
 from studies.executors import execute, make_executor
 from studies.ledger import Ledger, Row
-from studies.study import RunSpec, Study, StudyError, load_study
+from studies.study import RunSpec, Study, StudyError, load_study, study_names
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,16 @@ def resume(
 
 
 def summarise_again(folder: Path | str) -> StudyResult:
-    """Write the tables, the summary and the report of a campaign anew, flying nothing."""
+    """Write the tables, the summary and the report of a campaign anew, flying nothing.
+
+    Where the laboratory's study of that name still flies the same, its present texts, measures
+    and layout are taken.
+    """
     with Ledger.open(Path(folder)) as ledger:
-        return _write(ledger)
+        study = ledger.study
+        if study.name in study_names() and load_study(study.name).digest == study.digest:
+            study = load_study(study.name)
+        return _write(ledger, study)
 
 
 def read_run(reference: Path | str) -> tuple[Study, RunSpec]:
@@ -192,12 +199,12 @@ def _fly(ledger: Ledger, workers: int | None, scheduler: str | None, progress: b
     return _write(ledger)
 
 
-def _write(ledger: Ledger) -> StudyResult:
+def _write(ledger: Ledger, study: Study | None = None) -> StudyResult:
     # Imported when there is something to draw: scipy and matplotlib take a second to load.
     from studies.report import write_report
     from studies.summary import summarise
 
-    study, runs = ledger.study, ledger.runs
+    study, runs = study or ledger.study, ledger.runs
     table = ledger.finish()
     summary = summarise(study, table.to_pandas(), runs, ledger.folder)
     write_report(study, table.to_pandas(), summary, ledger.folder)

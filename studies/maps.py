@@ -25,6 +25,7 @@ FEWEST = 8  # pairs that the interval of a budget, or a tie, needs
 SURE = 0.95  # a cell in which fewer succeed says so, and wins nothing
 MISS = 1.0  # m; where even the least mean error is more, nobody wins
 COLUMNS = 3  # heat maps beside each other
+TABLES = ("table", "distributions")  # layouts with a table
 _SEED = 1979  # of the resampling
 
 
@@ -466,7 +467,7 @@ def _panels(study: Study) -> Iterator[_Panel]:
     *names, last = study.axes
     x = study.axes[last].label or last
     labels = _labels(study)
-    if study.layout == "table" or not names:
+    if study.layout in TABLES or not names:
         rows = [level.label or step for step, level in study.axes[last].steps.items()]
         for at in itertools.product(*(steps[name] for name in names)):
             found = {
@@ -509,12 +510,12 @@ def markdown_lines(
     figure, cells : str
         Paths of the figure and of the table of cells, as seen from the page.
     """
-    lines = [f"![Mean landing error by cell]({figure})", ""]
+    lines = [f"![Landing error by cell]({figure})", ""]
     lines += [f"Every cell with its intervals: [{cells}]({cells})."]
     if study.budgets:
         lines += ["", *(f"* {text}" for text in sentences(study, table)), ""]
         lines += [rule(budget) for budget in study.budgets]
-    if study.layout == "table":
+    if study.layout in TABLES:
         lines += ["", *table_lines(study, table, summary)]
     if study.promises:
         lines += ["", *promise_lines(study, summary)]

@@ -65,8 +65,8 @@ def tables(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> str
         "",
     ]
     if study.axes:
-        figure, cells = f"data/{study.name}-cells.svg", f"data/{study.name}.csv"
-        lines += maps.markdown_lines(study, table, summary, figure, cells)
+        figure = f"data/{study.name}-{_figure_name(study)}.svg"
+        lines += maps.markdown_lines(study, table, summary, figure, f"data/{study.name}.csv")
         return "\n".join(lines)
     lines += [f"![Landing error by row](data/{study.name}-error.svg)", ""]
     lines += (
@@ -157,18 +157,22 @@ def _draw(study: Study, table: pd.DataFrame, summary: Mapping[str, Any], data: P
     column = study.measures.error
     title, unit, scale = scale_of(column, summary)
     with figures.style():
-        if study.axes:
-            name, made = "cells", maps.draw(study, summary)
+        if study.drawn_by_cell:
+            made = maps.draw(study, summary)
         else:
             shown = samples(study, table, column, scale)
-            name, made = "error", figures.figure(9.4, 0.9 + 0.42 * len(shown))
+            made = figures.figure(9.4, 0.9 + 0.42 * len(shown))
             wide = all((sample.values > 0.0).all() and np.size(sample.values) for sample in shown)
             figures.boxes(made.subplots(), shown, f"{title} ({unit})", logarithmic=wide)
         made.savefig(
-            data / f"{study.name}-{name}.svg",
+            data / f"{study.name}-{_figure_name(study)}.svg",
             facecolor="white",
             metadata={"Date": None, "Creator": None},
         )
+
+
+def _figure_name(study: Study) -> str:
+    return "cells" if study.drawn_by_cell else "error"
 
 
 def main() -> None:

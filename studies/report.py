@@ -96,7 +96,7 @@ def _figures(
     """Title, explanation and SVG of each figure that has something to show."""
     if not summary["successes"]:
         return []
-    if study.axes:
+    if study.drawn_by_cell:
         return [_by_cell(study, table, summary)]
     drawn = []
     diamonds = " Diamonds: the published trials." if summary["published"] else ""

@@ -242,8 +242,9 @@ class Study:
     volatile: list[str] = Field(default_factory=lambda: ["cpu_s"])
     quick: Quick | None = None
     # How a study with axes is shown. maps: the last two axes by variant; curves: a line a variant
-    # over the last axis; table: variants beside each other over the last axis
-    layout: Literal["maps", "curves", "table"] = "maps"
+    # over the last axis; table: variants beside each other over the last axis; distributions: the
+    # same table, and a box a cell instead of its mean
+    layout: Literal["maps", "curves", "table", "distributions"] = "maps"
     budgets: list[Budget] = Field(default_factory=list)  # told in words, of a study with axes
     promises: list[Promise] = Field(default_factory=list)  # counted, of a study with axes
 
@@ -281,6 +282,11 @@ class Study:
         """Every dotted path that a grid or a distribution varies."""
         laws = [self.distributions, *(v.distributions for v in self.variants.values())]
         return list(dict.fromkeys([*self.grids, *(path for law in laws for path in law)]))
+
+    @property
+    def drawn_by_cell(self) -> bool:
+        """Whether figures show the cells of axes, and not the distribution of each condition."""
+        return bool(self.axes) and self.layout != "distributions"
 
     @property
     def conditions(self) -> list[Condition]:

@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 
 from studies import figures, maps, pages
-from studies.campaign import run_study
+from studies.campaign import run_study, summarise_again
+from studies.ledger import Ledger
 from studies.report import write_report
-from studies.study import Axis, Budget, Level, Promise, Study, Variant
+from studies.study import Axis, Budget, Level, Promise, Study, Variant, load_study
 from studies.summary import summarise
 
 PAIRS = 60
@@ -323,3 +324,35 @@ def test_a_page_gets_the_figure_budgets_and_cells(tmp_path: Path):
     assert len(pd.read_csv(docs / "data" / "toymap.csv")) == 6
     assert (docs / "data" / "toymap-cells.svg").exists()
     assert math.isfinite(pd.read_csv(docs / "data" / "toymap.csv")["landing_error_m_p99"].max())
+
+
+def test_a_page_of_distributions_draws_boxes_above_the_table(tmp_path: Path):
+    study = Study(
+        name="toyboxes",
+        scenario="toy",
+        experiment="tests.studies.toy:Gentle",
+        axes={"spread": Axis(values=[0.1, 0.2], paths={"toy.spread": 1.0})},
+        promises=[Promise(within=0.3)],
+        layout="distributions",
+    )
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (docs / "page.md").write_text("<!-- campaign toyboxes -->\n<!-- end -->\n")
+    run_study(study, tmp_path / "campaign", 40, workers=0, progress=False)
+    pages.write(tmp_path / "campaign", docs)
+    text = (docs / "page.md").read_text()
+    assert "(data/toyboxes-error.svg)" in text
+    assert (docs / "data" / "toyboxes-error.svg").exists()
+    assert "| spread | toy |" in text
+    assert "| within 30 cm | toy |" in text
+    html = (tmp_path / "campaign" / "report.html").read_text(encoding="utf-8")
+    assert "Within 30 cm" in html
+    assert "Touchdown points" in html
+
+
+def test_a_campaign_of_the_laboratory_is_told_in_its_present_words(tmp_path: Path):
+    now = load_study("moving-pad")
+    then = dataclasses.replace(now, description="Otherwise.", layout="table", promises=[])
+    Ledger.create(tmp_path / "campaign", then, 2).close()
+    told = summarise_again(tmp_path / "campaign").study
+    assert (told.description, told.layout) == (now.description, now.layout)
