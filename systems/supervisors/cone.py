@@ -14,7 +14,9 @@ pad it waits for a moment at which
 
     |e + v τ| + σ ≤ r,   r growing from touch_radius to touch_radius_limit while it waits,
 
-v the velocity relative to the pad, and then sits down at `touch_speed`.
+v the velocity relative to the pad, and then sits down at `touch_speed`. A gust that makes the
+vehicle lean puts a foot deeper and moves it vertically too: the more it leans beyond `free_lean`
+the higher it waits, and beyond `touch_lean` it does not sit down.
 
 Disturbances are not left to the position controller's integrator. What accelerates the vehicle
 besides its rotors is observed and fed forward with the opposite sign (a disturbance observer;
@@ -29,19 +31,20 @@ Ohnishi, Shibata, Murakami, "Motion control for advanced mechatronics", IEEE/ASM
 with c the mean rotor command behind the rotors' lag; d₀ is what the controller's integrator
 already holds against the steady wind. So in the last metre, seen or not, the wind is met by
 what it did a moment ago. The same d tells the ground: when the legs carry, d_z jumps. (It is
-not small before: wind and ground make the rotors lift more. A pad that rises softly
-from below is noticed because the vehicle does not sink any more.) The rotors stop at once, because
-a vehicle that is light on its legs slides.
+not small before: wind and ground make the rotors lift more. A pad that is met softly is
+noticed because the height does not fall as ordered.) The rotors stop at once, because a vehicle
+that is light on its legs slides.
 
 A pad that moves is followed with its velocity, vertically too. What is not seen is carried on by
 the estimator, so nothing is lost by the clock, but by k σ > ρ(h)/2. Then what another attempt can
 show decides. If this one has seen the pad on its way down, the vehicle holds for a while, goes
 round (climbs over the place, which counts an attempt) and comes again. Otherwise, and in the last
 attempt, every second makes it worse: it lands where the pad should be, at full speed, unless it
-sees it on the way, as with sensors that do not reach far. A pad that was never seen, or
-is known no more, is looked for from further down and then along a spiral whose windings lie
-within the cameras' view. When time is up it lands on the best it knows. Sensors are not
-switched by height: their covariances say which one counts.
+sees it on the way, as with sensors that do not reach far. The landing begins with a look at where
+the pad was seen last, or where the vehicle took off, from so far upwind that leaning cameras see
+it. A pad that was never seen, or is known no more, is looked for from further down and then along
+a spiral whose windings lie within the cameras' view. When time is up it lands on the best it
+knows. Sensors are not switched by height: their covariances say which one counts.
 """
 
 import math
@@ -68,6 +71,7 @@ _SLOW = 0.3  # m, of the feet above the pad, below which the vehicle does not br
 _CLOSE = 0.12  # m, of the feet above the pad, within which a push from below is the ground
 _AT_PAD = 0.06  # m, of the feet above the pad, at which one foot of a tilted vehicle may stand
 _ORDERED = 0.2  # m/s, rate of descent from which on not to sink means something
+_OBEYED = 0.4  # 1, of what is ordered: to sink less is to stand
 _STILL = 0.15  # m/s, vertical speed that tells the ground where no height is known
 
 
@@ -82,7 +86,8 @@ class ConeMemory(Memory):
     held_ay: float = 0.0
     push: float = math.nan  # m/s2, low-passed vertical disturbance
     thrust: float = math.nan  # 1, rotor command by that of level flight, behind the rotors' lag
-    still_since: float = NOT_YET  # s, at the pad it has not sunk since, though it should
+    still_since: float = NOT_YET  # s, at the pad it should have sunk since
+    still_feet: float = math.nan  # m, height of the feet then
     known: float = 0.0  # 0/1, the pad has been seen
     pad_x: float = math.nan  # m, the pad as last known
     pad_y: float = math.nan
@@ -108,13 +113,13 @@ class Cone:
     table = TransitionTable(
         initial="look",
         states=(
-            State("look", entry=("hold_position", "note_start"), stay=_WATCH),
+            State("look", entry=("note_start",), stay=(*_WATCH, "look_there", "hold_height")),
             State("descend", stay=(*_WATCH, "follow", "descend_in_cone")),
             State("settle", stay=(*_WATCH, "follow", "keep_low")),
             State("touch", stay=(*_WATCH, "follow", "sit_down")),
             State("hold", stay=(*_WATCH, "follow", "rise_for_view")),
             State("go_round", entry=("begin_attempt",), stay=(*_WATCH, "follow", "climb")),
-            State("look_lower", stay=(*_WATCH, "sink_to_look")),
+            State("look_lower", stay=(*_WATCH, "look_there", "sink_to_look")),
             State("search", entry=("begin_search",), stay=(*_WATCH, "fly_spiral")),
             State("land_anyway", stay=(*_WATCH, "follow_or_return", "sit_down_there")),
         ),
@@ -129,7 +134,8 @@ class Cone:
                 "land_anyway",
                 "time_is_up",
             ),
-            Transition("look", "descend", "certain"),
+            Transition("look", "descend", "seen_again"),
+            Transition("look", "descend", "certain_but_not_seen"),
             Transition("look", "look_lower", "looked_in_vain"),
             Transition("look_lower", "descend", "certain"),
             Transition("look_lower", "search", "low_enough_to_look"),
@@ -172,6 +178,20 @@ class Cone:
         """The height of the feet above the pad, m."""
         return s.z - self._pad(s)[2] + self.config.feet_height
 
+    def _settled(self, s: S) -> float:
+        """The height of the feet at which to wait for the moment to sit down, m.
+
+        A vehicle that leans has a foot deeper than their middle, and a gust that makes it lean
+        moves it vertically too. The height of a pad that heaves is known less well.
+        """
+        c = self.config
+        lean = max(self._lean(s) - c.free_lean, 0.0)
+        return c.settle_height + c.lean_height * lean + c.heave_time * abs(s.memory.pad_uz)
+
+    def _lean(self, s: S) -> float:
+        """The sine of the vehicle's tilt."""
+        return math.hypot(s.up_x, s.up_y)
+
     def _goal(self, s: S) -> tuple[float, float]:
         """Where the body must be so that it stands over the pad after it has come down level.
 
@@ -180,12 +200,19 @@ class Cone:
         """
         m, share = s.memory, self.config.feet_height / _GRAVITY
         x, y, _ = self._pad(s)
-        height = self._feet(s) - self.config.settle_height
-        high = max(height, 0.0) / _GRAVITY if self._seen_in_attempt(s) else 0.0
-        return (
-            x + share * m.drift_ax - high * m.lean_ax,
-            y + share * m.drift_ay - high * m.lean_ay,
-        )
+        high = self._feet(s) - self.config.settle_height if self._seen_in_attempt(s) else 0.0
+        up_x, up_y = self._upwind(s, high)
+        return x + share * m.drift_ax + up_x, y + share * m.drift_ay + up_y
+
+    def _upwind(self, s: S, height: float) -> tuple[float, float]:
+        """From what leaning cameras look at to where they are, `height` m above it."""
+        share = max(height, 0.0) / _GRAVITY
+        return -share * s.memory.lean_ax, -share * s.memory.lean_ay
+
+    def _expected(self, s: S) -> tuple[float, float]:
+        """Where the pad should be: where it was last known, else where the vehicle took off."""
+        m = s.memory
+        return (m.pad_x, m.pad_y) if m.known > 0.0 else (m.home_x, m.home_y)
 
     def _error(self, s: S) -> tuple[float, float]:
         x, y = self._goal(s)
@@ -203,7 +230,8 @@ class Cone:
 
     def _predicted(self, s: S) -> float:
         """|e + v τ|, m."""
-        m, lead = s.memory, self.config.touch_lead
+        m, c = s.memory, self.config
+        lead = c.touch_lead * max(self._feet(s) / c.settle_height, 1.0)
         ex, ey = self._error(s)
         return math.hypot(ex + (m.pad_ux - s.vx) * lead, ey + (m.pad_uy - s.vy) * lead)
 
@@ -246,6 +274,10 @@ class Cone:
             and not self.time_is_up(s)
         )
 
+    def certain_but_not_seen(self, s: S) -> bool:
+        """The place of the pad is known from before, and it should have been seen by now."""
+        return self.certain(s) and s.time - s.memory.entered >= self.config.glance_time
+
     def looked_in_vain(self, s: S) -> bool:
         """The target is not seen from here."""
         return s.time - s.memory.entered >= self.config.look_time
@@ -256,7 +288,7 @@ class Cone:
 
     def close_above_pad(self, s: S) -> bool:
         """The feet are so low that only sitting down is left."""
-        low = self._feet(s) <= self.config.settle_height + 0.05
+        low = self._feet(s) <= self._settled(s) + 0.05
         return low and self._spread(s) <= self._radius(s)
 
     def aligned(self, s: S) -> bool:
@@ -264,8 +296,9 @@ class Cone:
         c = self.config
         share = min((s.time - s.memory.entered) / c.patience, 1.0)
         allowed = c.touch_radius + (c.touch_radius_limit - c.touch_radius) * share * share
-        low = self._feet(s) <= c.settle_height + 0.08
-        return low and self._predicted(s) + s.goal_sigma <= allowed
+        low = self._feet(s) <= self._settled(s) + 0.08
+        upright = self._lean(s) <= c.touch_lean + (1.0 - c.touch_lean) * share * share
+        return low and upright and self._predicted(s) + s.goal_sigma <= allowed
 
     def blown_away(self, s: S) -> bool:
         """The vehicle has left the cone."""
@@ -278,8 +311,23 @@ class Cone:
 
     def on_the_ground(self, s: S) -> bool:
         """The legs carry, or the vehicle does not sink any more."""
-        since = s.memory.still_since
-        return self._struck(s) or (since >= 0.0 and s.time - since >= self.config.still_time)
+        return self._struck(s) or self._stands(s)
+
+    def _order(self, s: S) -> float:
+        """The rate at which it is asked to sink onto the pad, m/s; 0 if it is not."""
+        m = s.memory
+        return max(m.pad_uz - m.setpoint_vz, 0.0) if math.isnan(m.setpoint_z) else 0.0
+
+    def _stands(self, s: S) -> bool:
+        """At the pad, the vehicle has not sunk for a while, though it should have.
+
+        Told by the height: the velocities of vehicle and pad are known to 0.2 m/s only.
+        """
+        m = s.memory
+        age = s.time - m.still_since
+        if m.still_since < 0.0 or age < self.config.still_time:
+            return False
+        return m.still_feet - self._feet(s) < _OBEYED * self._order(s) * age
 
     def _struck(self, s: S) -> bool:
         """Something has pushed the vehicle from below just now."""
@@ -373,13 +421,12 @@ class Cone:
             m.setpoint_ax, m.setpoint_ay = m.held_ax - m.drift_ax, m.held_ay - m.drift_ay
 
     def watch_sinking(self, s: S) -> None:
-        """Keep the time since which the vehicle should sink at the pad and does not."""
+        """Note from time to time how high the vehicle is while it should sink at the pad."""
         m = s.memory
-        ordered = math.isnan(m.setpoint_z) and m.setpoint_vz - m.pad_uz < -_ORDERED
-        if not (ordered and self._feet(s) < _AT_PAD and s.vz - m.pad_uz > -0.5 * _ORDERED):
+        if self._order(s) < _ORDERED or self._feet(s) > _AT_PAD:
             m.still_since = NOT_YET
-        elif m.still_since < 0.0:
-            m.still_since = s.time
+        elif m.still_since < 0.0 or s.time - m.still_since >= self.config.still_time:
+            m.still_since, m.still_feet = s.time, self._feet(s)
 
     def track_pad(self, s: S) -> None:
         """Remember where the pad is and how it moves, or was when that was last known."""
@@ -409,12 +456,12 @@ class Cone:
         m.setpoint_ay += share * (c.position_gain * ey + c.velocity_gain * (m.pad_uy - s.vy))
 
     def follow_or_return(self, s: S) -> None:
-        """Go over the pad if it has ever been seen, else to where the climb ended."""
+        """Go over the pad if it has ever been seen, else to where the vehicle took off."""
         m = s.memory
         if m.known > 0.0:
             self.follow(s)
         else:
-            s.go_to(m.mark_x, m.mark_y, self.config.approach_speed)
+            s.go_to(m.home_x, m.home_y, self.config.approach_speed)
             m.target_in_use = 0.0
 
     def _braked(self, height: float, final: float) -> float:
@@ -435,12 +482,12 @@ class Cone:
         if inside < 0.0:
             self._sink(s, max(inside, -0.3) * c.descent_speed)
         else:
-            fastest = self._braked(height - c.settle_height, _CREEP)
+            fastest = self._braked(height - self._settled(s), _CREEP)
             self._sink(s, min(inside, 1.0) * min(c.descent_speed, fastest))
 
     def keep_low(self, s: S) -> None:
         """Stay with the feet just above the pad."""
-        self._sink(s, _LOW_GAIN * (self._feet(s) - self.config.settle_height))
+        self._sink(s, _LOW_GAIN * (self._feet(s) - self._settled(s)))
 
     def sit_down(self, s: S) -> None:
         """Sink to the pad or the ground."""
@@ -448,25 +495,36 @@ class Cone:
         height = s.height + c.feet_height
         if m.known > 0.0:
             height = min(height, self._feet(s)) if s.height_measured else self._feet(s)
-        self._sink(s, min(c.descent_speed, self._braked(height - _SLOW, c.touch_speed)))
+        fastest = self._braked(height - _SLOW, c.touch_speed)
+        if self._lean(s) > c.touch_lean and not self._overdue(s):  # wait for the gust to pass
+            fastest = min(fastest, _LOW_GAIN * (height - self._settled(s)))
+        self._sink(s, min(c.descent_speed, fastest))
+
+    def _overdue(self, s: S) -> bool:
+        """Time is up, and the way back has taken as long as it may."""
+        c = self.config
+        return s.time - s.memory.landing_started >= c.maximum_time + c.return_time
 
     def sit_down_there(self, s: S) -> None:
         """Sink where the pad should be, or anywhere if that takes too long."""
-        m, c = s.memory, self.config
-        late = s.time - m.landing_started >= c.maximum_time + c.return_time
-        if late or s.distance_to(m.setpoint_x, m.setpoint_y) < _FAR:
+        m = s.memory
+        if self._overdue(s) or s.distance_to(m.setpoint_x, m.setpoint_y) < _FAR:
             self.sit_down(s)
         else:
             self._sink(s, 0.0)
 
-    def hold_position(self, s: S) -> None:
-        """Stay over the point last asked for, at the present height."""
-        s.hold_horizontally()
+    def look_there(self, s: S) -> None:
+        """Go to where the cameras look at the place where the pad should be."""
+        (x, y), (up_x, up_y) = self._expected(s), self._upwind(s, s.height)
+        s.go_to(x + up_x, y + up_y, self.config.approach_speed)
+        s.memory.target_in_use = 0.0
+
+    def hold_height(self, s: S) -> None:
+        """Stay at the height that the mission ended at."""
         s.hold_height()
 
     def sink_to_look(self, s: S) -> None:
-        """Sink over the present place to where sensors that do not reach far see the pad."""
-        s.hold_horizontally()
+        """Sink to where sensors that do not reach far see the pad."""
         self._sink(s, self.config.look_speed)
 
     def rise_for_view(self, s: S) -> None:
@@ -493,8 +551,7 @@ class Cone:
         """Begin a spiral around the place where the pad should be."""
         m = s.memory
         m.turn = 0.0
-        known = m.known > 0.0
-        m.centre_x, m.centre_y = (m.pad_x, m.pad_y) if known else (m.setpoint_x, m.setpoint_y)
+        m.centre_x, m.centre_y = self._expected(s)
         m.target_in_use = 0.0
 
     def _pitch(self, s: S) -> float:
@@ -511,10 +568,10 @@ class Cone:
         pitch = self._pitch(s)
         along = math.hypot(self._spiral_radius(s), pitch / (2.0 * math.pi))
         m.turn += c.search_speed * s.period / along
-        radius = self._spiral_radius(s)
+        radius, (up_x, up_y) = self._spiral_radius(s), self._upwind(s, s.height)
         s.go_to(
-            m.centre_x + radius * math.cos(m.turn),
-            m.centre_y + radius * math.sin(m.turn),
+            m.centre_x + radius * math.cos(m.turn) + up_x,
+            m.centre_y + radius * math.sin(m.turn) + up_y,
             c.approach_speed,
         )
         m.setpoint_vx = -c.search_speed * math.sin(m.turn)
@@ -536,6 +593,10 @@ class ConeConfig:
     approach_speed: Positive = 5.0  # m/s, horizontal limit, ArduPilot's WPNAV_SPEED
     # The last step
     settle_height: Metres = 0.15  # m, of the feet above the pad
+    free_lean: NonNegative = 0.3  # 1, sine of the lean up to which that holds
+    lean_height: Metres = 1.5  # m by the sine of the lean beyond
+    heave_time: Seconds = 0.15  # s, by the pad's vertical speed
+    touch_lean: Positive = 0.36  # 1, sine of the lean from which it does not sit down at first
     touch_radius: Positive = 0.03  # m
     touch_radius_limit: Positive = 0.10  # m
     patience: Positive = 15.0  # s, over which the radius grows
@@ -554,6 +615,7 @@ class ConeConfig:
     sink_gain: NonNegative = 2.5  # 1/s
     sink_push: Positive = 2.0  # m/s2, at most
     # Losses
+    glance_time: Seconds = 1.0  # s, to look at a pad whose place is known
     look_time: Seconds = 3.0  # s, before a search begins
     look_height: Metres = 2.0  # m, of the feet above the ground, down to which it looks first
     look_speed: Positive = 0.7  # m/s
