@@ -49,7 +49,7 @@ def test_a_browser_shows_it(page, tmp_path):
             browser(), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
             "--no-first-run", "--disable-background-networking", "--disable-component-update",
             "--disable-sync", "--enable-logging=stderr", f"--user-data-dir={tmp_path / 'profile'}",
-            "--window-size=1280,4000", "--virtual-time-budget=8000",
+            "--window-size=1280,4000", "--virtual-time-budget=2000",
             f"--screenshot={picture}", page.as_uri(),
         ],
         capture_output=True, text=True, timeout=400, check=False,
