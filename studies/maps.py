@@ -6,6 +6,7 @@ the same runs. Errors are of the runs that succeeded, so a cell says how many th
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -252,18 +253,16 @@ def table_lines(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -
     time, and those that the pairs cannot tell from it.
     """
     conditions = {row["condition"]: row for row in summary["conditions"]}
-    *outer, last = study.axes
-    cells = {(cell.variant, *cell.levels.values()): cell for cell in study.cells}
+    last = list(study.axes)[-1]
     names, labels = list(_labels(study)), list(_labels(study).values())
     table = with_measures(study, table)
     lines = []
-    for at in itertools.product(*(study.axes[axis].steps for axis in outer)):
-        where = _where(study, dict(zip(outer, at, strict=True)))
+    for outer, rows in itertools.groupby(table_rows(study), key=lambda row: row[0]):
+        where = _where(study, dict(outer))
         title = study.axes[last].label or last
         head = f"{title} ({where})" if where else title
         lines += [f"| {head} | {' | '.join(labels)} |", "|---|" + "---:|" * len(names)]
-        for step, level in study.axes[last].steps.items():
-            row = {name: cells[key] for name in names if (key := (name, *at, step)) in cells}
+        for _, step, row in rows:
             best = winners(study, table, row, conditions)
             texts = [
                 _entry(conditions[row[name].condition.label], study, name in best)
@@ -271,15 +270,111 @@ def table_lines(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -
                 else "–"
                 for name in names
             ]
-            lines.append(f"| {level.label or step} | {' | '.join(texts)} |")
+            label = study.axes[last].steps[step].label or step
+            lines.append(f"| {label} | {' | '.join(texts)} |")
         lines.append("")
     lines.append(
         "Mean; 99th percentile of the error in cm, of the runs that landed, and how many "
         "those are where it is not all. Bold: the least mean, and whatever the pairs of landings "
-        f"cannot tell from it ({100 * CONFIDENCE:g} %), where {_percent(SURE)} land; nobody where "
+        f"cannot tell from it (95 %), where {_percent(SURE)} land; nobody where "
         f"the least mean is more than {MISS:g} m."
     )
     return lines
+
+
+def table_rows(
+    study: Study,
+) -> Iterator[tuple[tuple[tuple[str, str], ...], str, dict[str, Cell]]]:
+    """The rows of a study's tables: levels before the last axis, its step, cells by variant."""
+    *outer, last = study.axes
+    cells = {(cell.variant, *cell.levels.values()): cell for cell in study.cells}
+    for at in itertools.product(*(study.axes[axis].steps for axis in outer)):
+        for step in study.axes[last].steps:
+            row = {
+                name: cells[key] for name in _labels(study) if (key := (name, *at, step)) in cells
+            }
+            yield tuple(zip(outer, at, strict=True)), step, row
+
+
+def standing_lines(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> list[str]:
+    """Which variant leads the tables, and every row in which it does not, as Markdown.
+
+    It leads a row that has the least mean and the least 99th percentile of those that land `SURE`
+    of the time. None if there is nothing to compare.
+    """
+    conditions = {row["condition"]: row for row in summary["conditions"]}
+    table = with_measures(study, table)
+    rows = [row for row in table_rows(study) if len(row[2]) > 1]
+    least = [_least(study, conditions, row) for _, _, row in rows]
+    leads = Counter(best["mean"] for best in least if best)
+    if not leads:
+        return []
+    labels = _labels(study)
+    leader, count = leads.most_common(1)[0]
+    flown = sum(leader in row for _, _, row in rows)
+    firsts = sum(best.get("p99") == leader for best in least)
+    lines = []
+    for (outer, step, row), best in zip(rows, least, strict=True):
+        if leader in row and any(best.get(name) != leader for name in ("mean", "p99")):
+            where = _where(study, {**dict(outer), list(study.axes)[-1]: step})
+            equal = leader in winners(study, table, row, conditions)
+            lines.append(f"* {where}: {_behind(study, conditions, row, best, leader, equal)}")
+    head = (
+        f"**{labels[leader]}** has the least mean in {count} of {flown} rows and the least "
+        f"99th percentile in {firsts}, of what lands in {_percent(SURE)}."
+    )
+    return [head + " Not in:" if lines else head, "", *lines]
+
+
+def _number(condition: Mapping[str, Any], study: Study, name: str) -> float:
+    value = condition["statistics"][study.measures.error][name]["value"]
+    return math.nan if value is None else value
+
+
+def _least(
+    study: Study, conditions: Mapping[str, Mapping[str, Any]], row: Mapping[str, Cell]
+) -> dict[str, str]:
+    """The variants of the least mean and 99th percentile of a row; none if none lands surely."""
+    sure = {
+        name: found
+        for name, cell in row.items()
+        if ((found := conditions[cell.condition.label])["success"]["value"] or 0.0) >= SURE
+    }
+    if not sure:
+        return {}
+    return {
+        quantity: min(sure, key=lambda name: _number(sure[name], study, quantity))
+        for quantity in ("mean", "p99")
+    }
+
+
+def _behind(
+    study: Study,
+    conditions: Mapping[str, Mapping[str, Any]],
+    row: Mapping[str, Cell],
+    best: Mapping[str, str],
+    leader: str,
+    equal: bool,
+) -> str:
+    """By what another variant is ahead of `leader` in a row."""
+    found = {name: conditions[cell.condition.label] for name, cell in row.items()}
+    labels = _labels(study)
+    share = found[leader]["success"]["value"] or 0.0
+    if share < SURE:
+        most = max(found, key=lambda name: found[name]["success"]["value"] or 0.0)
+        text = f"{labels[leader]} lands in {_percent(round(share, 3))}"
+        if most == leader:
+            return f"{text}, the others in fewer"
+        return f"{text}, {labels[most]} in {_percent(round(found[most]['success']['value'], 3))}"
+    ahead = []
+    for quantity, title in (("mean", "mean"), ("p99", "99th percentile")):
+        if (name := best[quantity]) != leader:
+            first, second = (
+                _plain(CM * _number(found[who], study, quantity)) for who in (name, leader)
+            )
+            tie = ", which the pairs cannot tell apart" if quantity == "mean" and equal else ""
+            ahead.append(f"{title} {labels[name]} {first}, {labels[leader]} {second} cm{tie}")
+    return "; ".join(ahead)
 
 
 def promise_lines(study: Study, summary: Mapping[str, Any]) -> list[str]:
@@ -517,6 +612,7 @@ def markdown_lines(
         lines += [rule(budget) for budget in study.budgets]
     if study.layout in TABLES:
         lines += ["", *table_lines(study, table, summary)]
+        lines += ["", *standing_lines(study, table, summary)]
     if study.promises:
         lines += ["", *promise_lines(study, summary)]
     return [*lines, ""]

@@ -217,6 +217,29 @@ def test_the_winner_and_what_the_pairs_cannot_tell_from_it_are_bold(tmp_path: Pa
     assert p99 == pytest.approx(100.0 * errors.quantile(0.99), rel=5e-3)
 
 
+def test_the_leader_is_named_and_where_it_does_not_lead(tmp_path: Path):
+    base = np.linspace(0.05, 0.25, 200)
+    # a does not fly the second row
+    study, table = league({"a": 0.5 * base, "b": base, "c": np.full(200, 0.2)})
+    lines = maps.standing_lines(study, table, summarise(study, table, len(table), tmp_path))
+    assert lines == [
+        "**A** has the least mean in 1 of 1 rows and the least 99th percentile in 1, "
+        "of what lands in 95 %.",
+        "",
+    ]
+    wide = np.where(np.arange(200) < 4, 0.9, 0.1 * base)  # four far misses
+    study, table = league({"a": np.full(200, 0.05), "b": wide, "c": base}, {"c": 0.5})
+    lines = maps.standing_lines(study, table, summarise(study, table, len(table), tmp_path))
+    assert lines == [
+        "**B** has the least mean in 2 of 2 rows and the least 99th percentile in 1, "
+        "of what lands in 95 %. Not in:",
+        "",
+        "* no fault: 99th percentile A 5, B 90 cm",
+    ]
+    study, table = league({"a": base, "b": 0.9 * base}, {"a": 0.9, "b": 0.8})
+    assert maps.standing_lines(study, table, summarise(study, table, len(table), tmp_path)) == []
+
+
 def test_nobody_wins_where_all_miss(tmp_path: Path):
     study, table = league({"a": np.full(9, 1.234567), "b": np.full(9, 12.4)})
     summary = summarise(study, table, len(table), tmp_path)
