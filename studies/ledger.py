@@ -125,9 +125,14 @@ class Ledger:
         """How many runs the campaign is to have."""
         return int(self._get("runs"))
 
+    @property
+    def provenance(self) -> dict[str, str]:
+        """The versions and the digest of the source that fly the runs."""
+        return json.loads(self._get("provenance"))
+
     def require_same_provenance(self) -> None:
         """Raise `StudyError` if this machine would not fly the runs as they were begun."""
-        begun, here = json.loads(self._get("provenance")), _provenance(self.study)
+        begun, here = self.provenance, _provenance(self.study)
         differing = [key for key in begun if begun[key] != here.get(key)]
         if differing:
             what = ", ".join(

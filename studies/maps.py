@@ -307,7 +307,7 @@ def standing_lines(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]
     rows = [row for row in table_rows(study) if len(row[2]) > 1]
     least = [_least(study, conditions, row) for _, _, row in rows]
     leads = Counter(best["mean"] for best in least if best)
-    if not leads:
+    if len(rows) < 2 or not leads:
         return []
     labels = _labels(study)
     leader, count = leads.most_common(1)[0]

@@ -20,6 +20,8 @@ from scipy.stats import cramervonmises_2samp
 
 from studies import figures, maps
 from studies.campaign import summarise_again
+from studies.ledger import Ledger
+from studies.provenance import commit_of
 from studies.published import PUBLISHED, SIGNIFICANCE
 from studies.report import samples
 from studies.study import Study
@@ -43,7 +45,9 @@ def write(folder: Path, docs: Path) -> None:
         rows = table[["run", "condition", *study.measures.columns()]]
     rows.round(DECIMALS).to_csv(data / f"{study.name}.csv", index=False)
     _draw(study, table, result.summary, data)
-    text = tables(study, table, result.summary)
+    with Ledger.open(folder) as ledger:
+        flown = _flown(ledger.provenance["source"])
+    text = tables(study, table, result.summary, flown)
     block = re.compile(
         rf"(<!-- campaign {re.escape(study.name)} -->\n).*?(<!-- end -->)", re.DOTALL
     )
@@ -54,14 +58,19 @@ def write(folder: Path, docs: Path) -> None:
             page.write_text(new, encoding="utf-8")
 
 
-def tables(study: Study, table: pd.DataFrame, summary: Mapping[str, Any]) -> str:
-    """The figures and tables of a campaign as Markdown."""
+def _flown(source: str) -> str:
+    commit = commit_of(source)
+    return f"at commit {commit}" if commit else f"by a source of no commit ({source[:8]})"
+
+
+def tables(study: Study, table: pd.DataFrame, summary: Mapping[str, Any], flown: str) -> str:
+    """The figures and tables of a campaign as Markdown; `flown` says by what source."""
     counts = [condition["runs"] for condition in summary["conditions"]]
     many = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
     place = "cell" if study.axes else "row"
     lines = [
-        f"{summary['done']} landings, {many} a {place} (the study asks for {study.runs}); "
-        f"campaign seed {study.seed}. Intervals: 95 %.",
+        f"{summary['done']} landings, {many} a {place} (the study asks for {study.runs}), "
+        f"flown {flown}; campaign seed {study.seed}. Intervals: 95 %.",
         "",
     ]
     if study.axes:
