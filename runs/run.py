@@ -224,7 +224,7 @@ LABORATORIES = {
     "landing_without_gps": "runs.landing_without_gps:RunwayLaboratory",
 }
 _laboratories: list[Laboratory] = []
-_KEPT = 16  # diagrams a process keeps; each costs about a megabyte
+_KEPT = 64  # diagrams a process keeps; each costs about a megabyte
 
 
 def laboratory(scenario: Any) -> Laboratory:
